@@ -6,12 +6,11 @@ attributes: `E2EProfile` (`P01` or `P02`, empty for none), `E2EDataIds` (hex: 16
 the usual `GenMsgCycleTime`, in ms.
 """
 
-import difflib
 import hashlib
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,7 +22,7 @@ from cantools.database.can import Message as CantoolsMessage
 from cantools.database.can import Signal as CantoolsSignal
 from cantools.database.errors import Error as CantoolsError
 
-from can_dbc.errors import DatabaseError
+from can_dbc.errors import DatabaseError, expected_name
 from can_dbc.protection import AliveCounter, Identity, Profile, Protection
 
 __all__ = ["DEFAULT_DATABASE", "Database", "DatabaseError", "Message", "Signal", "load_database"]
@@ -114,7 +113,7 @@ class Message:
         try:
             return self.signals[name]
         except KeyError:
-            hint = _near(name, self.signals)
+            hint = expected_name(name, self.signals)
             raise DatabaseError(
                 f"{self.path}: message {self.name}: no signal {name!r}, {hint}"
             ) from None
@@ -137,7 +136,7 @@ class Database:
         try:
             return self.messages[name]
         except KeyError:
-            hint = _near(name, self.messages)
+            hint = expected_name(name, self.messages)
             raise DatabaseError(f"{self.path}: no message {name!r}, {hint}") from None
 
 
@@ -159,15 +158,6 @@ def load_database(path: Path) -> Database:
         sha256=hashlib.sha256(content).hexdigest(),
         messages=MappingProxyType({m.name: m for m in _with_foreign_identities(messages)}),
     )
-
-
-def _near(name: str, names: Iterable[str]) -> str:
-    known = list(names)
-    folded = {entry.casefold(): entry for entry in known}
-    matches = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
-    if matches:
-        return "did you mean " + " or ".join(folded[entry] for entry in matches) + "?"
-    return "expected one of " + ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
 
 
 def _read(path: Path) -> bytes:

@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from can_dbc.errors import FileError
+from can_dbc.errors import FileError, expected_name
 
 _MAX_BYTES = 4 * 1024 * 1024
 """Largest file; a model with a thousand struts has a tenth of it."""
@@ -101,6 +101,16 @@ _NO_YAML = (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError,
 """What PyYAML raises for a text that is none, or for a tag whose value does not fit it."""
 
 
+_CURES = {
+    "mapping values are not allowed": "a second colon, or an indentation that is not that of the "
+    "lines around it",
+    "<block end>": "expected the indentation of the lines around it",
+    "\\t": "a tab, expected blanks",
+    "<stream end>": "a bracket is open to the end of the file",
+}
+"""Part of what PyYAML says -> what a person has to look for."""
+
+
 def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
     """Text of a file of at most `max_bytes`.
 
@@ -108,6 +118,8 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
         FileError: The file is missing, unreadable, too large or not UTF-8.
     """
     try:
+        if path.is_fifo():  # reading one would wait for ever
+            raise FileError(f"{path}: is a pipe, expected a file")
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
@@ -131,7 +143,9 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f" line {mark.line + 1}" if mark else ""
-        raise FileError(f"{source}:{where} is no valid YAML: {error.problem}") from error
+        problem = error.problem or ""
+        cure = next((text for sign, text in _CURES.items() if sign in problem), problem)
+        raise FileError(f"{source}:{where} is no valid YAML: {cure}") from error
     except (*_NO_YAML, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{source}: is no valid YAML: {reason}") from error
@@ -188,14 +202,14 @@ def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> st
     if kind == "missing":
         return f"{source}: {key}: is missing, expected a value{more}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = ", ".join(_keys(model.model_json_schema(), parts[:-1]))
-        expected = f", expected one of {known}" if known else ""
+        known = _keys(model.model_json_schema(), parts[:-1])
+        expected = f", {expected_name(str(parts[-1]), known)}" if known else ""
         return f"{source}: {key}: unknown key{expected}{more}"
     if kind == "union_tag_invalid":
         context = cast("dict[str, str]", first.get("ctx", {}))
         tag, choices = (context[name].strip("'<>") for name in ("tag", "expected_tags"))
-        expected = choices.replace("'", "").replace("<", "").replace(">", "")
-        return f"{source}: {key}: {tag!r}: expected one of {expected}{more}"
+        expected = choices.replace("'", "").replace("<", "").replace(">", "").split(", ")
+        return f"{source}: {key}: {tag!r}: {expected_name(tag, expected)}{more}"
     if kind in _NO_MAPPING:
         shown = repr(cast("object", first["input"]))[:60]
         return f"{source}: {key}: {shown}: expected keys and values{more}"

@@ -22,6 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from can_dbc.errors import expected_name
 from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validate
 from dart_model.effects import CATALOGUE, effect
 from dart_model.errors import ModelError
@@ -141,7 +142,7 @@ class EffectSpec(_Frozen):
     @model_validator(mode="after")
     def _is_in_the_catalogue(self) -> "EffectSpec":
         if self.name not in CATALOGUE:
-            raise ValueError(f"name {self.name!r}: expected one of {', '.join(sorted(CATALOGUE))}")
+            raise ValueError(f"name {self.name!r}: {expected_name(self.name, sorted(CATALOGUE))}")
         expected = [parameter.name for parameter in effect(self.name).parameters]
         missing = [name for name in expected if name not in self.parameters]
         unknown = [name for name in self.parameters if name not in expected]
@@ -292,19 +293,19 @@ class ModelSpec(_Frozen):
             if body.joint.parent not in known:
                 raise ValueError(
                     f"body {body.name}: joint.parent {body.joint.parent!r}: "
-                    f"expected one of {', '.join(known)} (parents stand before children)"
+                    f"{expected_name(body.joint.parent, known)} (parents stand before children)"
                 )
             known.append(body.name)
         for strut in self.struts:
             for end in strut.between:
                 if end not in known:
                     raise ValueError(
-                        f"strut {strut.name}: between {end!r}: expected one of {', '.join(known)}"
+                        f"strut {strut.name}: between {end!r}: {expected_name(end, known)}"
                     )
         body_name = self.applied_force_body
         if body_name is not None and body_name not in known[1:]:
             raise ValueError(
-                f"applied_force_body {body_name!r}: expected one of {', '.join(known[1:])}"
+                f"applied_force_body {body_name!r}: {expected_name(body_name, known[1:])}"
             )
 
     def strut(self, name: str) -> StrutSpec:

@@ -1,9 +1,9 @@
 """Every effect a model can be given, one file a family."""
 
-import difflib
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from can_dbc.errors import expected_name
 from dart_model.effects import (
     backlash,
     damping,
@@ -76,9 +76,7 @@ class UnknownEffectError(ModelError):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)
-        choices = ", ".join(near or sorted(CATALOGUE))
-        super().__init__(f"effect {name!r}: expected one of {choices}")
+        super().__init__(f"effect {name!r}: {expected_name(name, sorted(CATALOGUE))}")
 
 
 def effect(name: str) -> Effect:

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from can_dbc.addressing import Filter
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from can_dbc.frame import Frame
 
 FRAMES_A_MS = 64
@@ -251,6 +251,17 @@ def _interface_options(options: Mapping[str, object]) -> dict[str, object]:
     return found
 
 
+def check_interface(name: str) -> None:
+    """Refuse an interface that python-can, with what is installed for it, does not have.
+
+    Raises:
+        BusError: It is unknown.
+    """
+    if name not in can.VALID_INTERFACES:
+        expected = expected_name(name, sorted(can.VALID_INTERFACES))
+        raise BusError(f"bus.interface {name!r}: {expected}")
+
+
 def open_bus(
     config: BusConfig, filters: frozenset[Filter] | None = None, *, listen_only: bool = False
 ) -> can.BusABC:
@@ -261,6 +272,7 @@ def open_bus(
     Raises:
         BusError: The interface cannot be opened.
     """
+    check_interface(config.interface)
     options = _interface_options(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
@@ -293,6 +305,26 @@ def open_bus(
     except Exception as error:  # drivers raise whatever they like
         raise BusError(
             f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "
-            f"cannot be opened: {_describe(error)}"
+            f"cannot be opened: {_describe(error)}{_cure(config, error)}"
         ) from error
     return bus
+
+
+def _cure(config: BusConfig, error: Exception) -> str:
+    """What to do about a SocketCAN interface that cannot be opened; empty where that is not known.
+
+    python-can raises what the kernel reports, an `OSError`.
+    """
+    if config.interface != "socketcan":
+        return ""
+    name = config.channel
+    up = f"`ip link set {name} up type can bitrate {config.bitrate}` as root"
+    cures = {
+        errno.EAFNOSUPPORT: "this kernel has no SocketCAN, expected one with the module can_raw "
+        "(`modprobe can_raw` as root), or another interface",
+        errno.ENODEV: f"expected an interface that `ip link` lists, switched on by {up}",
+        errno.ENETDOWN: f"expected {up}",
+        errno.EPERM: "expected the rights to open raw sockets",
+    }
+    cure = cures.get(getattr(error, "errno", None) or 0)
+    return "" if cure is None else f": {cure}"

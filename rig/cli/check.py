@@ -7,7 +7,15 @@ import typer
 
 from rig.cli.junit import JUnitFile, Outcome, write_junit
 from rig.cli.summary_file import SummaryFolder, write_summary
-from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, print_json, print_table, styled
+from rig.cli.terminal import (
+    FAILED,
+    ConfigFile,
+    JsonFlag,
+    print_json,
+    print_table,
+    print_text,
+    styled,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +41,11 @@ def check_command(
         print_json(as_dicts)
     else:
         _print(config, findings)
+        if not any(finding.severity is Severity.ERROR for finding in findings):
+            print_text(
+                f"Next: `rig run {config} --listen-only --out first` for some seconds of the "
+                f"bench's usual motion, then `rig tune {config} --run first --out tuned.yaml`"
+            )
     write_summary(out, {"findings": as_dicts})
     outcomes = [
         Outcome(finding.what, finding.text, finding.severity is Severity.ERROR)

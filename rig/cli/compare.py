@@ -41,7 +41,9 @@ def compare_command(
     from rig.dyno.comparison import compare_dampers, trends_over_dose
 
     if not dose and len(runs) != 2:
-        raise InputError(f"{len(runs)} records, expected two, or --dose once for each")
+        raise InputError(
+            f"{len(runs)} given, expected two records to compare, or --dose NUMBER once for each"
+        )
     records = [characterise(path, strut) for path in runs]
     if dose:
         trends = trends_over_dose(records, dose)

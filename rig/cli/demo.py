@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.cli.progress import progress_bar, status_line, stoppable
 from rig.cli.result_tables import print_case, print_diagnosis, print_run
 from rig.cli.terminal import JsonFlag, console, print_json, print_text
@@ -46,7 +46,7 @@ def demo(
     from rig.demo.cases import CASES, DemoOptions, run_case
 
     if case not in (STORY, *CASES):
-        raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
+        raise InputError(f"--case {case!r}: {expected_name(case, (STORY, *CASES))}")
     out = out or free_folder(Path("rig-demo"))
     refuse_full(out)
     if case == STORY:

@@ -55,3 +55,8 @@ def diagnose(
     print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
         print_text(f"Printed: {out}/report.pdf")
+    if result.diagnosis.effects or result.diagnosis.linear:
+        print_text(
+            f"Next: `rig run CONFIG --model {out}/corrected.yaml`, whose observer is to be tuned "
+            "again: `rig tune` with that model and that run"
+        )

@@ -8,7 +8,7 @@ import typer
 from can_dbc.errors import InputError
 from rig.cli.terminal import print_text, refuse_existing
 
-EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig check my.yaml`"
+EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig zero my.yaml --length-m 0.36`"
 
 
 def init(
@@ -33,4 +33,5 @@ def init(
         out.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    print_text(f"Written: {out}. Read it, set bus and model, then `rig check {out}`.")
+    print_text(f"Written: {out}. Read it, and set bus and model.")
+    print_text(f"Next, with the strut's length now: `rig zero {out} --length-m LENGTH`")

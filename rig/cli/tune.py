@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.cli.progress import progress_bar
 from rig.cli.terminal import (
     ConfigFile,
@@ -87,7 +87,7 @@ def tune_command(
     from rig.tuning.tune import tune, write_config
 
     if observer not in KINDS:
-        raise InputError(f"--observer {observer!r}: expected one of {', '.join(KINDS)}")
+        raise InputError(f"--observer {observer!r}: {expected_name(observer, KINDS)}")
     refuse_existing(out, plot)
     source = _source(run, residual_n, up_to_hz, noise_std_m)
     plan, aim = load_plan(config), Aim(damping_ratio, gain_margin)
@@ -105,6 +105,8 @@ def tune_command(
     for path in (out, plot):
         if path is not None:
             print_text(f"Written: {path}")
+    if out is not None:
+        print_text(f"Next: `rig run {out}`")
 
 
 def _source(

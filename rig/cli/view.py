@@ -10,7 +10,8 @@ import typer
 
 from can_dbc.errors import InputError
 from rig.cli.progress import stoppable
-from rig.cli.terminal import console
+from rig.cli.terminal import console, print_text
+from rig.log.file_names import RUN_FILE
 
 EXAMPLES = (
     "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"
@@ -76,6 +77,9 @@ def view(
     # Behind the hash, which a browser never sends.
     address = server.address if token is None else f"{server.address}#{token}"
     console.print(f"{address} (on this machine only; Ctrl-C ends it)", soft_wrap=True)
+    for run in runs:
+        if not (run / RUN_FILE).exists():
+            print_text(f"{run}: no run yet; the page shows it when it begins")
     # Every user of the machine can read a browser's command line, and the token on it.
     if not no_browser and token is None:
         webbrowser.open(address)

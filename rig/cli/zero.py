@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.cli.progress import progress_line, stoppable
 from rig.cli.terminal import ConfigFile, JsonFlag, print_json, print_text
 
@@ -90,7 +90,7 @@ def _channel(plan: "Plan", strut: str | None, tare: str | None) -> "Channel":
             raise InputError(f"--strut: expected one of {', '.join(names)}")
         name = names[0] if strut is None else strut
         if name not in names:
-            raise InputError(f"--strut {name}: no height is measured, expected {', '.join(names)}")
+            raise InputError(f"--strut {name}: no height is measured, {expected_name(name, names)}")
         return find_channel(plan, name)
     channel = find_channel(plan, tare)
     if channel.quantity.dimension is not Dimension.FORCE:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
@@ -122,7 +122,7 @@ def _read_strut(
         raise InputError(f"{path}: has the struts {', '.join(names)}, expected --strut")
     name = strut or names[0]
     if name not in names:
-        raise InputError(f"{path}: --strut {name}: expected one of {', '.join(names)}")
+        raise InputError(f"{path}: --strut {name}: {expected_name(name, names)}")
     index = list(config.get("signals", {})["height"]).index(name)
     height_m = recording.heights_m[:, index]
     if cells_n is not None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from can_dbc.yaml_file import parse_mapping
 from rig.files.folders import refuse_full
 from rig.formats.mf4 import read_mf4, write_mf4
@@ -46,7 +46,7 @@ def export_run(
             `out` exists or cannot be written.
     """
     if kind not in FORMATS:
-        raise InputError(f"format {kind!r}: expected one of {', '.join(FORMATS)}")
+        raise InputError(f"format {kind!r}: {expected_name(kind, FORMATS)}")
     if out.exists():
         raise InputError(f"{out}: exists, expected a new file")
     run = read(folder)

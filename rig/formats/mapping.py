@@ -8,9 +8,11 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from can_dbc.calibration import Calibration
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, SiConversion, si_conversion
 from can_dbc.yaml_file import Finite, Positive, load_yaml
+from rig.channels.channel import Zero
 
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Unit = Annotated[str, Field(min_length=1, max_length=40)]
@@ -82,25 +84,22 @@ class TimeColumn(_Section):
 
 
 class _Channel(_Section):
-    """A measured quantity: `si = sign * gain * reading` in `unit`, converted to SI, plus an offset.
+    """A measured quantity: gain times reading in `unit`, converted to SI, by its calibration.
 
     Attributes:
         column: Its column.
         unit: Unit of gain times reading, e.g. ``mm``, ``kN``, ``lbf``.
         gain: Units a reading, e.g. of a sensor whose volts were recorded.
-        sign: -1 where the foreign table has the opposite sign.
     """
 
     column: ColumnName
     unit: Unit
     gain: Finite = 1.0
-    sign: Literal[1, -1] = 1
 
     @property
-    def offset(self) -> float:
-        """What is added, in SI: the last field."""
-        *_, (_, value) = self
-        return value
+    def calibration(self) -> Calibration:
+        """From gain times reading to what is measured, in SI."""
+        return Calibration()
 
     @model_validator(mode="after")
     def _is_not_constant(self) -> "_Channel":
@@ -110,21 +109,56 @@ class _Channel(_Section):
 
 
 class HeightChannel(_Channel):
-    """A height; `offset_m` is added, e.g. the strut's length where the sensor reads zero."""
+    """A height.
 
-    offset_m: Finite = 0.0
+    Attributes:
+        zero: A reading, in m after the gain, at a known length of the strut; without it the reading
+            is the length.
+        reversed: Whether the sensor reads less while the strut gets longer.
+    """
+
+    zero: Zero | None = None
+    reversed: bool = False
+
+    @property
+    def calibration(self) -> Calibration:
+        """By the zero and the direction of the sensor."""
+        zero = self.zero or Zero(reads=0.0, at_m=0.0)
+        return Calibration(zero.reads, zero.at_m, self.reversed)
+
+    @model_validator(mode="after")
+    def _is_a_length(self) -> "HeightChannel":
+        if self.reversed and self.zero is None:
+            raise ValueError("reversed: expected zero: {reads, at_m} with it")
+        return self
 
 
 class ForceChannel(_Channel):
-    """A force; `offset_n` is added, e.g. minus the reading of an unloaded cell."""
+    """A force.
 
-    offset_n: Finite = 0.0
+    Attributes:
+        tare_n: Reading, in N after the gain, without a force.
+        reversed: Whether the table has the opposite sign.
+    """
+
+    tare_n: Finite = 0.0
+    reversed: bool = False
+
+    @property
+    def calibration(self) -> Calibration:
+        """By the tare and the direction of the cell."""
+        return Calibration(self.tare_n, 0.0, self.reversed)
 
 
 class TemperatureChannel(_Channel):
     """A temperature; `offset_k` is added."""
 
     offset_k: Finite = 0.0
+
+    @property
+    def calibration(self) -> Calibration:
+        """By the offset."""
+        return Calibration(0.0, self.offset_k)
 
 
 class TableMapping(_Section):
@@ -201,13 +235,14 @@ def output_columns(mapping: TableMapping) -> list[OutputColumn]:
 def _output_column(name: str, channel: _Channel, dimension: Dimension) -> OutputColumn:
     key = name.rpartition("_")[0]
     conversion = unit_conversion(channel.unit, dimension, key)
-    factor = conversion.factor * channel.gain * channel.sign
+    calibration = channel.calibration
+    factor = calibration.sign * conversion.factor * channel.gain
     words = f"{name} = {factor:.9g} * column {channel.column!r}"
-    offset = conversion.offset + channel.offset
+    offset = calibration.apply(conversion.offset)
     if offset:
         words += f" {'+' if offset > 0 else '-'} {abs(offset):.9g}"
     gain = "" if channel.gain == 1.0 else f", {channel.gain:g} {channel.unit} a reading"
-    reversed_ = ", sign reversed" if channel.sign < 0 else ""
+    reversed_ = ", sign reversed" if calibration.is_reversed else ""
     words += f" (read in {channel.unit}{gain}{reversed_})"
     return OutputColumn(name, key, channel.column, channel.unit, factor, offset, words)
 

@@ -192,9 +192,7 @@ def mts_mapping(source: Path, rebound: str) -> TableMapping:
     return TableMapping(
         time=TimeColumn(column=time, unit=unit[time]),
         height=HeightChannel(column=height, unit=unit[height]),
-        strut_force=ForceChannel(
-            column=force, unit=unit[force], sign=-1 if rebound == "positive" else 1
-        ),
+        strut_force=ForceChannel(column=force, unit=unit[force], reversed=rebound == "positive"),
         temperature=None
         if temperature is None
         else TemperatureChannel(column=temperature, unit=unit[temperature]),

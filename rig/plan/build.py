@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from can_dbc.database import Message
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from dart_model.plant import DartPlant, PrescribedStrut
 from dart_model.protocol import AnyPlant
 from dart_model.spec import ModelSpec
@@ -55,11 +55,10 @@ def build_plant(plan: Plan) -> AnyPlant:
     Raises:
         InputError: There is no such engine, or the model cannot be built.
     """
-    make = ENGINES.get(plan.config.engine)
+    engine = plan.config.engine
+    make = ENGINES.get(engine)
     if make is None:
-        raise InputError(
-            f"{plan.source}: engine {plan.config.engine!r}: expected one of {', '.join(ENGINES)}"
-        )
+        raise InputError(f"{plan.source}: engine {engine!r}: {expected_name(engine, ENGINES)}")
     return make(plan.model)
 
 

@@ -16,6 +16,7 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import tagged_union_schema
 
+from can_dbc.errors import expected_name
 from can_dbc.yaml_file import Finite, Positive
 from rig.bridge.devices import DeviceSettings
 from rig.bridge.mode_supervisor import Supervision
@@ -165,7 +166,7 @@ class Signals(_Frozen):
         keys = list(cast("dict[object, object]", data)) if isinstance(data, dict) else []
         for key in keys:
             if key not in _KEYS:
-                raise ValueError(f"{key}: unknown key, expected one of {', '.join(_KEYS)}")
+                raise ValueError(f"{key}: unknown key, {expected_name(str(key), _KEYS)}")
         return cast("object", data)
 
     @property
@@ -215,7 +216,7 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
                 known = [item.key for item in choices]
                 for key in cast("dict[object, object]", data):
                     if key not in known:
-                        raise ValueError(f"{key}: unknown key, expected one of {', '.join(known)}")
+                        raise ValueError(f"{key}: unknown key, {expected_name(str(key), known)}")
                 return cast("object", data)
             case _:
                 return data

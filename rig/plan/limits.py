@@ -13,7 +13,7 @@ from pathlib import Path
 
 from can_dbc.codec import si_range, si_step
 from can_dbc.database import Message
-from can_dbc.errors import DatabaseError, InputError
+from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
 from rig.bridge.supervision_limits import Limit, LimitedValue, Limits
 from rig.channels.channel import Channel, Role
@@ -78,7 +78,8 @@ def resolve_limits(
 
 def _check_name(name: str | None, known: Sequence[str], where: str, problem: str) -> None:
     if name is not None and name not in known:
-        raise InputError(f"{where}: {name}: {problem}, expected {', '.join(known) or 'none'}")
+        expected = expected_name(name, known) if known else "expected none"
+        raise InputError(f"{where}: {name}: {problem}, {expected}")
 
 
 def _check_overlap(

@@ -12,7 +12,7 @@ from typing import TypeVar
 from can_dbc.calibration import Calibration, calibrate
 from can_dbc.codec import si_range, si_round, si_step
 from can_dbc.database import Database, Message, alive_counter
-from can_dbc.errors import DatabaseError, InputError
+from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
 from dart_model.spec import ModelSpec
 from rig.bridge.devices import Device
@@ -124,6 +124,12 @@ class Plan:
     def is_prescribed(self) -> bool:
         """Whether the motion is prescribed: a dyno."""
         return self.config.prescribed_motion is not None
+
+    @property
+    def has_force(self) -> bool:
+        """Whether a run of it can be diagnosed: a force was measured with the heights."""
+        forces = (APPLIED_FORCE, LOAD_CELL_FORCE)
+        return any(channel.quantity in forces for channel in self.channels)
 
     def bench_channel(self, quantity: Quantity) -> Channel | None:
         """Channel of a quantity of the bench; None where it is not measured."""
@@ -245,7 +251,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
         for name in names:
             if name not in struts:
                 raise InputError(
-                    f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
+                    f"{source}: {key}.{name}: no such strut, {expected_name(name, struts)}"
                 )
     status = config.status
     if "status" not in config.model_fields_set:

@@ -14,7 +14,7 @@ from rig.bridge.free_model import grace_of_applied_force_ns
 from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
-from rig.bus.bus import SHARED_INTERFACES
+from rig.bus.bus import SHARED_INTERFACES, BusError, check_interface
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
@@ -88,6 +88,7 @@ def check(plan: Plan) -> list[Finding]:
         _staleness(plan, heights),
         *_switches(plan),
         *_applied_force(plan),
+        *_interface(plan),
         *_watchdog(plan),
         *_publication(plan),
         *_limits(plan),
@@ -252,6 +253,15 @@ def _switches(plan: Plan) -> list[Finding]:
         if message not in [_message(height) for height in plan.heights]:
             findings.append(_protection(message))
     return findings
+
+
+def _interface(plan: Plan) -> list[Finding]:
+    """Whether the bus can be opened at all, as far as that is known without doing so."""
+    try:
+        check_interface(plan.config.bus.interface)
+    except BusError as error:
+        return [Finding(Severity.ERROR, "bus.interface", str(error))]
+    return []
 
 
 def _watchdog(plan: Plan) -> list[Finding]:

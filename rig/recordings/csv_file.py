@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.files.delimited_text import read_csv_columns
 from rig.recordings.recording import Array, Recording, RecordingError
 
@@ -75,9 +75,27 @@ def _struts_of(name: str, columns: Sequence[str], struts: Sequence[str] | None) 
     for strut in named:
         if strut not in struts:
             raise RecordingError(
-                f"{name}: header: strut {strut[:40]!r}: expected one of {', '.join(struts)}"
+                f"{name}: header: strut {strut[:40]!r}: {expected_name(strut, struts)}"
             )
     return list(struts)
+
+
+def _expected(kind: str) -> str:
+    """What was expected in place of an unknown column, and what makes it of such a table."""
+    separator = next((sign for sign in ";\t" if sign in kind), "")
+    quantities = {column.rpartition("_")[0]: column for column in COLUMNS}
+    quantity, _, unit = kind.rpartition("_")
+    if separator:
+        text = f"expected columns separated by commas (in a mapping: separator: {separator!r})"
+    elif quantity in quantities:
+        text = f"expected {quantities[quantity]} (in a mapping: unit: {unit})"
+    else:
+        columns = ", ".join(COLUMNS)
+        return (
+            f"expected one of {columns}, a height or strut force with its strut as in "
+            "height_m:tyre; `rig import` makes them of a foreign table"
+        )
+    return f"{text}; `rig import TABLE --mapping FILE` makes them of a foreign table"
 
 
 def _check_header(name: str, columns: list[str]) -> list[str]:
@@ -88,10 +106,7 @@ def _check_header(name: str, columns: list[str]) -> list[str]:
     for column in columns:
         kind, colon, strut = column.partition(":")
         if kind not in COLUMNS or (colon and (kind not in _OF_A_STRUT or not strut)):
-            raise RecordingError(
-                f"{name}: header: column {column[:40]!r}: expected one of {', '.join(COLUMNS)}, "
-                "a height or strut force with its strut as in height_m:tyre"
-            )
+            raise RecordingError(f"{name}: header: column {column[:40]!r}: {_expected(kind)}")
         if columns.count(column) > 1:
             raise RecordingError(f"{name}: header: column {column} occurs twice, expected once")
         kinds.append(kind)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.channels.channel import Channel, MeasuredSignal, Zero
 from rig.files.yaml_edit import set_keys
 from rig.log.reader import read_run
@@ -58,8 +58,8 @@ def find_channel(plan: Plan, name: str) -> Channel:
     for channel in plan.channels:
         if channel.name == name:
             return channel
-    known = ", ".join(channel.name for channel in plan.channels)
-    raise InputError(f"{plan.source}: {name}: is not measured, expected one of {known}")
+    known = [channel.name for channel in plan.channels]
+    raise InputError(f"{plan.source}: {name}: is not measured, {expected_name(name, known)}")
 
 
 def entry_of(plan: Plan, channel: Channel) -> MeasuredSignal:

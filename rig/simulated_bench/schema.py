@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, model_validator
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.simulated_bench.effects import EFFECT_KINDS, parameter_error
 from rig.simulated_bench.samples import Samples, read_samples
 
@@ -304,7 +304,7 @@ class UndeclaredEffect(_Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.name not in EFFECT_KINDS:
-            raise ValueError(f"name = {self.name!r}, expected one of {', '.join(EFFECT_KINDS)}")
+            raise ValueError(f"name = {self.name!r}, {expected_name(self.name, EFFECT_KINDS)}")
         wrong = parameter_error(self.name, self.parameters)
         if wrong is not None:
             raise ValueError(f"parameters: {wrong}")
@@ -446,7 +446,7 @@ def _unique(key: str, names: list[str]) -> list[str]:
 
 def _check_known(key: str, name: str, known: list[str]) -> None:
     if name not in known:
-        raise ValueError(f"{key} = {name!r}, expected one of {', '.join(known)}")
+        raise ValueError(f"{key} = {name!r}, {expected_name(name, known)}")
 
 
 _UNSEEN_IN_PRESCRIBED_MOTION = ("added_mass", "hidden_mass")

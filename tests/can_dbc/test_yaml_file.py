@@ -1,9 +1,12 @@
 """Numbers of a YAML file are what they look like, and cost what they are long."""
 
+import os
+import re
+
 import pytest
 
-from can_dbc.errors import FileError
-from can_dbc.yaml_file import parse_mapping
+from can_dbc.errors import FileError, expected_name
+from can_dbc.yaml_file import parse_mapping, read_text
 
 
 @pytest.mark.parametrize(
@@ -57,3 +60,41 @@ def test_a_number_that_is_too_long_or_in_base_60_is_one_line(text, line):
     assert message.startswith("x.yaml: line 2 is no valid YAML: ")
     assert "expected" in message
     assert len(message) < 200
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "expected"),
+    [
+        ("stif", ["damping", "stiffness"], "did you mean stiffness?"),
+        ("HEIGHT", ["height", "weight", "force"], "did you mean height or weight?"),
+        ("x", ["one"], "expected one"),
+        ("x", ["one", "two"], "expected one of one, two"),
+        (
+            "x",
+            [f"n{i}" for i in range(20)],
+            f"expected one of {', '.join(f'n{i}' for i in range(12))}, ...",
+        ),
+    ],
+)
+def test_the_nearest_names_are_suggested(name, known, expected):
+    assert expected_name(name, known) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("bus:\n  a: 1\n   b: 2\n", "line 3 is no valid YAML: a second colon, or an indentation"),
+        ("a:\n  b: 1\n c: 2\n", "line 3 is no valid YAML: expected the indentation of the lines"),
+        ("\tbus: {}\n", "line 1 is no valid YAML: a tab, expected blanks"),
+        ("a: [1,\n", "a bracket is open to the end of the file"),
+    ],
+)
+def test_a_line_that_is_no_yaml_names_its_cure(text, expected):
+    with pytest.raises(FileError, match=re.escape(expected)):
+        parse_mapping(text, "my.yaml")
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileError, match="is a pipe, expected a file"):
+        read_text(tmp_path / "pipe")

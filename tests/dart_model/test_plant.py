@@ -469,7 +469,7 @@ def test_a_guide_need_not_be_vertical():
         (("between: [world, body]", "between: [body, other]"), "between 'other': expected one of"),
         (
             ("name: oscillator", "name: oscillator\napplied_force_body: nobody"),
-            "'nobody': expected",
+            "'nobody': did you mean body",
         ),
     ],
 )

@@ -50,8 +50,8 @@ def mapping(folder, place="{}", load="Load"):
     path = folder / "mapping.yaml"
     path.write_text(
         f"time: {{column: {names['Time']}, unit: ms}}\n"
-        f"height: {{column: {names['Travel']}, unit: mm, offset_m: 0.3}}\n"
-        f"strut_force: {{column: {place.format(load)}, unit: lbf, sign: -1}}\n"
+        f"height: {{column: {names['Travel']}, unit: mm, zero: {{reads: 0, at_m: 0.3}}}}\n"
+        f"strut_force: {{column: {place.format(load)}, unit: lbf, reversed: true}}\n"
     )
     return load_mapping(path)
 

@@ -63,7 +63,7 @@ def test_the_command_and_a_mapping(tmp_path):
     assert "sign reversed" in " ".join(ended.output.split())
     (tmp_path / "mapping.yaml").write_text(
         "time: {column: Running Time, unit: s}\n"
-        "height: {column: Axial Displacement, unit: in, offset_m: 0.3}\n"
+        "height: {column: Axial Displacement, unit: in, zero: {reads: 0, at_m: 0.3}}\n"
         "strut_force: {column: Axial Load, unit: lbf}\n"
     )
     import_table(source, load_mapping(tmp_path / "mapping.yaml"), tmp_path / "b.csv")

@@ -42,8 +42,8 @@ Zeit;Weg;Kraft;Temp
 GERMAN_MAPPING = """
 table: {separator: ";", decimal: ",", skip_lines: 2, skip_after_names: 1}
 time: {column: Zeit, unit: ms}
-height: {column: Weg, unit: mm, sign: -1, offset_m: 0.5}
-strut_force: {column: 3, unit: kN, offset_n: -20}
+height: {column: Weg, unit: mm, reversed: true, zero: {reads: 0, at_m: 0.5}}
+strut_force: {column: 3, unit: kN, tare_n: 20}
 temperature: {column: Temp, unit: degF}
 """
 

@@ -103,7 +103,10 @@ def test_a_signal_has_one_zero(tmp_path):
         "strut": {"kind": "kalman", "filter": {"bandwidth_hz": 19, "noise_std_m": 2e-5}}
     }
     path.write_text(yaml.safe_dump(data))
-    with pytest.raises(InputError, match=r"further\.strut\.cell: .* another zero, direction or tare in signals\.load_cell_f"):
+    with pytest.raises(
+        InputError,
+        match=r"further\.strut\.cell: .* another zero, direction or tare in signals\.load_cell_f",
+    ):
         load_plan(path)
 
 
