@@ -182,7 +182,7 @@ def test_bodies_above_an_prescribed_strut_move_by_their_own_laws() -> None:
         ),
         (
             {"prescribed_motion": {"strut": "other", "components": [SINE]}},
-            "prescribed_motion.strut = 'other', expected one of strut",
+            "prescribed_motion.strut = 'other', expected strut",
         ),
         (
             {"prescribed_motion": {"strut": "strut", "components": [{**SINE, "amplitude_n": 1.0}]}},
