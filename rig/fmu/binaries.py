@@ -51,7 +51,7 @@ _FLAGS = (
     "-Wall",
     "-Wextra",
 )
-_TIMEOUT_S = 300.0
+_TIMEOUT_S = 1200.0
 """Time that a compiler may take: far longer than one needs, so that one that hangs is ended."""
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import can
 import cantools
 
+from rig.log.file_names import EVENTS_FILE
 from rig.plan.config import CONFIGS
 from tests.slow_reference import SLOW_DBC, running, write_slow_bridge, write_slow_dbc
 
@@ -77,6 +78,10 @@ def end_by(name: str, config: Path, folder: Path) -> dict[str, object]:
         bridge.send_signal(signal.Signals[name])
         if name == "SIGSTOP":
             time.sleep(1.5)
+            # Ended before it has taken another tick it would not know that it stood still.
+            bridge.send_signal(signal.SIGCONT)
+            events = folder / EVENTS_FILE
+            wait_for(lambda: "ticks_missing" in events.read_text(), "an event")
         else:
             bridge.wait(60.0)
             time.sleep(0.5)
