@@ -346,7 +346,7 @@ def model_file(name: str, folder: Path) -> Path:
     for path in (folder / name, MODELS / f"{name}.yaml"):
         if path.is_file():
             return path
-    choices = ", ".join(sorted(path.stem for path in MODELS.glob("*.yaml")))
+    choices = ", ".join(shipped_models())
     raise ModelError(f"model {name!r}: expected a file in {folder}, or one of {choices}")
 
 
@@ -357,6 +357,11 @@ def load_model(path: Path) -> ModelSpec:
         ModelError: One line that names file, key, value and what was expected.
     """
     return parse_model(read_text(path), str(path), path.parent)
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that come with the package."""
+    return sorted(path.stem for path in MODELS.glob("*.yaml"))
 
 
 def load_named_model(name: str, folder: Path, named_by: Path | None = None) -> ModelSpec:

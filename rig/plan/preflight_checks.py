@@ -9,7 +9,7 @@ from can_dbc.bus_load import frame_time_s
 from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
-from dart_model.spec import InlineSkeleton
+from dart_model.spec import InlineSkeleton, shipped_models
 from rig.bridge.free_model import grace_of_applied_force_ns
 from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
@@ -74,6 +74,7 @@ def check(plan: Plan) -> list[Finding]:
         *map(_protection, read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
         *map(_sample_times, channel_of.values()),
+        *_model(plan),
         *[_zero(plan, channel) for channel in plan.heights],
         *_resolution(plan),
         *[
@@ -119,6 +120,15 @@ def _protection(message: Message) -> Finding:
         text = "none in the DBC: a corrupted, repeated or foreign frame passes as data"
         return Finding(Severity.WARNING, what, text)
     return Finding(Severity.OK, what, f"E2E profile {protection.identity.profile.value}")
+
+
+def _model(plan: Plan) -> list[Finding]:
+    """Whether a bench on a real bus has a model of its own."""
+    if plan.config.bus.interface == _IN_STEP or plan.config.model not in shipped_models():
+        return []
+    text = f"{plan.config.model} is an example that comes with rig, not this bench: expected a "
+    text += "file with its own masses, lengths, stiffness and damping"
+    return [Finding(Severity.WARNING, "model", text)]
 
 
 def _zero(plan: Plan, height: Channel) -> Finding:

@@ -101,7 +101,7 @@ def propose(database: Database) -> str:
     # A DBC that names no nodes says nothing of who sends what.
     others = [item for item in messages if item.sender != bench] or list(messages)
     lines = [
-        "model: reference          # the bench's own model file",
+        "model: reference          # an example: set the bench's own model file",
         f"dbc: {database.path.name}",
         "bus: {interface: socketcan, channel: can0, bitrate: 500000}",
         "signals:",

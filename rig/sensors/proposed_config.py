@@ -135,7 +135,7 @@ def configuration_text(
     rest = "" if bus.data_bitrate is None else f", data_bitrate: {bus.data_bitrate}"
     channel = bus.channel if bus.channel.replace("_", "").isalnum() else json.dumps(bus.channel)
     lines = [
-        "model: reference          # the bench's own model file",
+        "model: reference          # an example: set the bench's own model file",
         f"dbc: {DBC_NAME}",
         f"bus: {{interface: {bus.interface}, channel: {channel}, bitrate: {bus.bitrate}{rest}}}",
         "signals:",

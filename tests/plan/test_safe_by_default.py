@@ -12,7 +12,7 @@ from rig.cli.main import main
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.plan.preflight_checks import check
+from rig.plan.preflight_checks import Severity, check
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 
@@ -120,6 +120,15 @@ def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
         Mode.SETTLING,
         Mode.SAFE,
     ]
+
+
+@pytest.mark.parametrize(("interface", "is_named"), [("socketcan", True), ("virtual", False)])
+def test_a_real_bench_with_the_model_of_an_example_is_a_warning(tmp_path, interface, is_named):
+    path = config(tmp_path, bus={"interface": interface, "channel": "can0"})
+    found = [it for it in check(load_plan(path)) if it.what == "model"]
+    assert bool(found) is is_named
+    assert all("reference is an example that comes with rig" in it.text for it in found)
+    assert all(it.severity is Severity.WARNING for it in found)
 
 
 @pytest.mark.parametrize(
