@@ -1,5 +1,6 @@
 """A bus through python-can's `virtual` interface."""
 
+import errno
 import json
 
 import can
@@ -79,10 +80,32 @@ def test_listen_only_never_calls_the_interface(opened, peer, monkeypatch):
     assert peer.receive() == []
 
 
-def test_an_interface_that_does_not_exist_is_one_line():
-    with pytest.raises(BusError, match=r"bus\.interface 'nosuch'.*cannot be opened") as caught:
-        Bus(BusConfig("nosuch", "x", 500_000))
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("nosuch", "expected one of canalystii, "), ("socketcn", "did you mean socketcan")],
+)
+def test_an_interface_that_does_not_exist_is_one_line(name, expected):
+    with pytest.raises(BusError, match=rf"bus\.interface '{name}': {expected}") as caught:
+        Bus(BusConfig(name, "x", 500_000))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("number", "cure"),
+    [
+        (errno.EAFNOSUPPORT, "`modprobe can_raw` as root"),
+        (errno.ENODEV, "`ip link set can7 up type can bitrate 500000` as root"),
+        (errno.ENETDOWN, ": expected `ip link set can7 up"),
+        (errno.EIO, "os error$"),
+    ],
+)
+def test_a_kernels_refusal_names_its_cure(monkeypatch, number, cure):
+    def refuse(**_arguments):
+        raise OSError(number, "os error")
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(BusError, match=rf"'can7': cannot be opened: .*{cure}"):
+        Bus(BusConfig("socketcan", "can7", 500_000))
 
 
 def test_a_closed_bus_is_an_error_of_the_bus(config):

@@ -283,5 +283,5 @@ def test_a_signal_that_cannot_say_it_is_one_line(valid, text, tmp_path):
 def test_an_engine_that_is_not_there_is_one_line(tmp_path):
     text = (CONFIGS / "reference.yaml").read_text() + "\nengine: magic\n"
     (tmp_path / "my.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"my\.yaml: engine 'magic': expected one of dart"):
+    with pytest.raises(InputError, match=r"my\.yaml: engine 'magic': expected dart"):
         build_bridge(load_plan(tmp_path / "my.yaml"))
