@@ -158,8 +158,14 @@ def with_faults(line: Line, config: Path, folder: Path) -> dict[str, Fault]:
 
 
 def assert_friction_was_found(found: dict[str, Any]) -> None:
-    """That a diagnosis names what the dyno has and the model lacks."""
-    assert found["verdict"] == "explained"
+    """That a diagnosis names what the dyno has and the model lacks, and nothing else.
+
+    Frames that wait for a busy machine are no noise of a sensor: what they leave makes the verdict
+    of a right answer a partial one.
+    """
+    assert found["verdict"] in ("explained", "partly_explained"), found
+    residual_n = found["held_out"]["residual_force_rmse_n"]
+    assert residual_n["after"] < 0.1 * residual_n["before"], found
     (effect,) = found["effects"]
     assert effect["family"] == "friction"
     friction = effect["parameters"]["coulomb_force_n"]
