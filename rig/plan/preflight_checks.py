@@ -133,11 +133,11 @@ def _model(plan: Plan) -> list[Finding]:
 
 def _zero(plan: Plan, height: Channel) -> Finding:
     """Whether a reading of a height's sensor is known to be the strut's length."""
-    what, zero = f"zero of {height.name}", plan.config.signals.height[height.name].zero
+    entry, what = plan.config.signals.height[height.name], f"zero of {height.name}"
+    zero = entry.zero
     if zero is not None:
         text = f"a reading of {zero.reads * 1e3:g} mm is a length of {zero.at_m * 1e3:g} mm"
-        is_reversed = plan.config.signals.height[height.name].reversed
-        return Finding(Severity.OK, what, text + (", reversed" if is_reversed else ""))
+        return Finding(Severity.OK, what, text + (", reversed" if entry.reversed else ""))
     if _message(height).signal(height.signal).offset:
         return Finding(Severity.OK, what, "that of the DBC")
     text = "none was set: what the sensor reads counts as the strut's length; expected zero: "
@@ -322,7 +322,8 @@ def _limits(plan: Plan) -> list[Finding]:
     may_freeze = [
         channel.name
         for channel in vital_channels(plan.config, plan.channels)
-        if LimitedValue.UNCHANGED_S not in {row.value for row in _rows(plan, channel)}
+        if LimitedValue.UNCHANGED_S
+        not in {row.value for row in plan.limits.channels[channel.index]}
     ]
     if may_freeze:
         text = f"none on unchanged_s of {' and '.join(may_freeze)}: a sensor that freezes before "
@@ -337,13 +338,6 @@ def _limits(plan: Plan) -> list[Finding]:
             text = _describe_rows(rows)
             findings.append(Finding(Severity.OK, f"limits of {channel.name}", text))
     return findings
-
-
-def _rows(plan: Plan, channel: Channel) -> Sequence[Limit]:
-    """The limits on what a channel measures."""
-    if channel.role is Role.HEIGHT:
-        return plan.limits.struts[channel.strut]
-    return plan.limits.channels[plan.channels.index(channel)]
 
 
 def _describe_rows(rows: Sequence[Limit]) -> str:
