@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
 import pytest
 from msgspec import Struct
 
@@ -22,7 +23,7 @@ from rig.bridge.bridge import Bridge, BridgeState
 from rig.bridge.values import Mode
 from rig.plan import build
 from rig.plan.load import load_plan
-from tests.bench.test_tick_speed import TICKS, Subject, compared
+from tests.bench.test_tick_speed import TICKS, Subject, compare_rounds
 from tests.bridge.cores import MS
 from tests.bridge.full_car import FullCar
 
@@ -195,9 +196,9 @@ def test_four_observers_in_a_full_car_against_one(tmp_path, capsys, monkeypatch)
         four = bridge_of(car, "full_car.yaml", suspensions, observer)
         subjects[f"{kind}, one strut"] = ticks_of(one, alone, 1)
         subjects[f"{kind}, four struts"] = ticks_of(four, car, 4)
-    found = compared(subjects, capsys)
+    found = compare_rounds(subjects, capsys)
     for kind in ("PI", "noise-aware"):
-        ratio = found[f"{kind}, four struts"] / found[f"{kind}, one strut"]
+        ratio = np.median(found[f"{kind}, four struts"] / found[f"{kind}, one strut"])
         with capsys.disabled():
             print(f"{kind}: four cost {ratio:.2f} times one")
         # Measured: 3.0 with PI, 3.45 to 3.6 noise-aware. 2.5 was wanted.

@@ -7,9 +7,11 @@ without a check, a mode or a limit. Both are mostly Python: their ratio is the s
 while that of a tick to DART alone was 8.2 on one and 12.4 on another.
 The body moves, as under the reference case's applied force: for one at rest DART skips a fifth of
 its work.
-Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them; CPU time
-is taken, the fastest round counts, and the spread is printed (`pytest -s`). A ratio of two memory
-patterns is another one beside a test that fills the cache: `.ci/run` runs these by themselves.
+Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them. CPU time
+is taken, and what is compared is the median over the rounds of a ratio or a difference within one
+round: the fastest rounds of two subjects need not have met the same machine. The spread is printed
+(`pytest -s`). A ratio of two memory patterns is another one beside a test that fills the cache:
+`.ci/run` runs these by themselves.
 """
 
 import math
@@ -53,8 +55,10 @@ pytestmark = pytest.mark.long
 Subject = Callable[[], None]
 
 
-def compared(subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
-    """Time of one tick of each subject in µs, and a table of the ratios to the first."""
+def compare_rounds(
+    subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]
+) -> dict[str, np.ndarray]:
+    """Time of one tick of each subject in each round, µs; prints the ratios to the first."""
     times: dict[str, list[float]] = {name: [] for name in subjects}
     for _ in range(ROUNDS):
         for name, subject in subjects.items():
@@ -68,10 +72,10 @@ def compared(subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]) -
             ratios = np.percentile(np.array(found) / np.array(times[first]), [10, 50, 90])
             low, middle, high = ratios
             print(
-                f"{name:42} {min(found):7.2f} us {min(found) / min(times[first]):6.2f} times,"
-                f" per round {middle:5.2f} ({low:.2f} to {high:.2f})"
+                f"{name:42} {np.median(found):7.2f} us,"
+                f" {middle:5.2f} times ({low:.2f} to {high:.2f})"
             )
-    return {name: min(found) for name, found in times.items()}
+    return {name: np.array(found) for name, found in times.items()}
 
 
 def dart_world() -> tuple[dartpy.simulation.World, dartpy.dynamics.Skeleton]:
@@ -225,7 +229,7 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
             plant.step(loaded, 1e-3, 11.0)
             plant.load(state, (0.0,), 10.0, 20.0)
 
-    found = compared(
+    found = compare_rounds(
         {
             "DART, array functions": array_loop(observing=False),
             "DART, scalar functions": scalar_loop(observing=False),
@@ -237,12 +241,12 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    assert tick / found["cantools, DART and a PI by hand"] <= 2.6  # measured: 1.9 to 2.0
+    assert np.median(tick / found["cantools, DART and a PI by hand"]) <= 2.6  # measured: 1.9 to 2.0
 
 
 def test_an_observer_adds_a_fraction_of_the_loop_by_hand(capsys):
     """Against DART alone its share was 1.19 on one machine and 1.36 on another."""
-    found = compared(
+    found = compare_rounds(
         {
             "DART, array functions": array_loop(observing=False),
             "the same with an observer": array_loop(observing=True),
@@ -253,13 +257,15 @@ def test_an_observer_adds_a_fraction_of_the_loop_by_hand(capsys):
         capsys,
     )
     by_hand = found["cantools, DART and a PI by hand"]
+    arrays = found["the same with an observer"] - found["DART, array functions"]
+    scalars = found["these with an observer"] - found["DART, scalar functions"]
     # Measured: 0.05 to 0.09, the innovation's own value included.
-    assert found["the same with an observer"] - found["DART, array functions"] < 0.2 * by_hand
-    assert found["these with an observer"] - found["DART, scalar functions"] < 0.2 * by_hand
+    assert np.median(arrays / by_hand) < 0.2
+    assert np.median(scalars / by_hand) < 0.2
 
 
 def test_a_second_observer_costs_no_more_than_the_first(capsys):
-    found = compared(
+    found = compare_rounds(
         {
             "reference, model alone": core_steps("reference", (0.4,), observing=False),
             "reference, observed": core_steps("reference", (0.4,), observing=True),
@@ -268,10 +274,11 @@ def test_a_second_observer_costs_no_more_than_the_first(capsys):
         },
         capsys,
     )
-    one = found["reference, observed"] - found["reference, model alone"]
-    two = found["quarter car, observed"] - found["quarter car, model alone"]
+    alone = found["quarter car, model alone"]
+    one = np.median(found["reference, observed"] - found["reference, model alone"])
+    two = np.median(found["quarter car, observed"] - alone)
     # The difference of two times is noisy; the quarter car's own time bounds what it may be.
-    assert two <= 2.0 * max(one, 0.0) + 0.25 * found["quarter car, model alone"]
+    assert two <= 2.0 * max(one, 0.0) + 0.25 * np.median(alone)
 
 
 def test_a_tick_over_a_virtual_bus(capsys):
