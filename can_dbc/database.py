@@ -8,20 +8,16 @@ the usual `GenMsgCycleTime`, in ms.
 
 import hashlib
 import math
-import re
-from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
-import cantools.database
-from cantools.database.can import Database as CantoolsDatabase
 from cantools.database.can import Message as CantoolsMessage
 from cantools.database.can import Signal as CantoolsSignal
-from cantools.database.errors import Error as CantoolsError
 
+from can_dbc.dbc_statements import parse_statements
 from can_dbc.errors import DatabaseError, expected_name
 from can_dbc.protection import AliveCounter, Identity, Profile, Protection
 
@@ -33,9 +29,6 @@ DEFAULT_DATABASE = Path(__file__).with_name("rig.dbc")
 SIZE_MAX_BYTES = 16 * 1024 * 1024
 """Largest DBC file that is read."""
 
-_LENGTH_MAX_BYTES = 1785  # the longest J1939 transport message; larger ones cannot be meant
-_LAYOUTS_MAX = 65_536  # a 16-bit multiplexer; cantools takes about 3 s for as many
-_RANGES_SUM_MAX = 2_000_000
 _STANDARD_ID_MAX = 0x7FF
 _EXTENDED_ID_MAX = 0x1FFF_FFFF
 _COUNTER_LARGEST = 2**32
@@ -56,6 +49,7 @@ class Signal:
         minimum: Smallest physical value, in `unit`, or None if the DBC gives no range.
         maximum: Largest physical value, in `unit`, or None if the DBC gives no range.
         unit: Unit as written in the DBC, empty if none.
+        comment: Comment in the DBC, empty if none.
         multiplexer: Name of the signal that selects this one, or None if it is always there.
         multiplexer_ids: Raw values of the multiplexer under which the signal is there.
     """
@@ -71,6 +65,7 @@ class Signal:
     minimum: float | None
     maximum: float | None
     unit: str
+    comment: str
     choices: Mapping[int, str]
     is_multiplexer: bool
     multiplexer: str | None
@@ -121,21 +116,32 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Database:
-    """The messages of one DBC file, by name; `sha256` is that of the file's bytes, in hex."""
+    """The messages of one DBC file.
+
+    Attributes:
+        sha256: Of the file's bytes, in hex.
+        messages: Messages that can be used, by name.
+        passed_over: Why another message, or another part of the file, cannot be used.
+    """
 
     path: Path
     sha256: str
     messages: Mapping[str, Message]
+    passed_over: Mapping[str, str]
 
     def message(self, name: str) -> Message:
         """Return the message of a name.
 
         Raises:
-            DatabaseError: There is none; the message lists names that come near.
+            DatabaseError: There is none, or it cannot be used; the error says why, or lists names
+                that come near.
         """
         try:
             return self.messages[name]
         except KeyError:
+            why = self.passed_over.get(f"message {name}")
+            if why is not None:
+                raise DatabaseError(f"{self.path}: message {name}: {why}") from None
             hint = expected_name(name, self.messages)
             raise DatabaseError(f"{self.path}: no message {name!r}, {hint}") from None
 
@@ -143,21 +149,37 @@ class Database:
 def load_database(path: Path) -> Database:
     """Read a DBC file of at most 16 MiB, in UTF-8 or Windows-1252.
 
-    Units are kept as written; a codec converts them.
+    Units are kept as written; a codec converts them. A message that cannot be used, such as one
+    whose signals overlap or do not fit, that shares its name, id or data id with another, or has
+    a protection that cannot work, is passed over: the file's others can be used.
 
     Raises:
-        DatabaseError: The file cannot be read, is no DBC, has signals that overlap or do not fit,
-            an id, name or data id twice, or a protection that cannot work.
+        DatabaseError: The file cannot be read, is no DBC, or has no message that can be used.
     """
     content = _read(path)
-    parsed = _parse(path, _decode(path, content))
-    messages = [_message(path, message) for message in parsed]
-    _refuse_duplicates(path, messages)
+    parsed, passed_over = parse_statements(path, _decode(path, content))
+    messages: list[Message] = []
+    for message in parsed:
+        try:
+            messages.append(_message(path, message))
+        except DatabaseError as error:
+            passed_over[f"message {message.name}"] = _reason(path, message.name, error)
+    passed_over |= _duplicates(messages)
+    usable = [item for item in messages if f"message {item.name}" not in passed_over]
+    if not usable and passed_over:
+        what, why = next(iter(passed_over.items()))
+        raise DatabaseError(f"{path}: {what}: {why}")
     return Database(
         path=path,
         sha256=hashlib.sha256(content).hexdigest(),
-        messages=MappingProxyType({m.name: m for m in _with_foreign_identities(messages)}),
+        messages=MappingProxyType({m.name: m for m in _with_foreign_identities(usable)}),
+        passed_over=MappingProxyType(passed_over),
     )
+
+
+def _reason(path: Path, message: str, error: DatabaseError) -> str:
+    """An error's text without file and message."""
+    return str(error).removeprefix(f"{path}: message {message}: ")
 
 
 def _read(path: Path) -> bytes:
@@ -186,55 +208,6 @@ def _decode(path: Path, content: bytes) -> str:
         except UnicodeDecodeError:
             continue
     raise DatabaseError(f"{path}: not text, expected a DBC file")
-
-
-_MESSAGE_LENGTH = re.compile(r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)")
-_SIGNAL_POSITION = re.compile(r":\s*(\d+)\s*\|\s*(\d+)\s*@")
-_MULTIPLEXER_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(\d+)\s+\w+\s+(\w+)([^;]*)")
-_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
-
-
-def _refuse_excess(path: Path, text: str) -> None:
-    """Refuse sizes for which cantools would build lists of any length."""
-    limit = _LENGTH_MAX_BYTES
-    for match in _MESSAGE_LENGTH.finditer(text):
-        if len(match[1]) > 6 or int(match[1]) > limit:
-            raise DatabaseError(
-                f"{path}: message of {match[1][:20]} bytes, expected at most {limit}"
-            )
-    for match in _SIGNAL_POSITION.finditer(text):
-        if any(len(part) > 6 or int(part) > 8 * limit for part in match.groups()):
-            raise DatabaseError(f"{path}: signal at {match[0][1:40]} does not fit in any message")
-    _refuse_layouts(path, text)
-
-
-def _refuse_layouts(path: Path, text: str) -> None:
-    # cantools lists every value of every range, and builds a frame layout for every combination
-    # of the values of nested multiplexers.
-    largest: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    total = 0
-    for message, multiplexer, ranges in _MULTIPLEXER_RANGES.findall(text):
-        for first, last in _RANGE.findall(ranges):
-            # Values may be the same for many signals: the largest bounds how many there are.
-            digits = max(len(first), len(last))
-            end = _RANGES_SUM_MAX + 1 if digits > 9 else int(last) + 1
-            total += max(end - int(first[:9]), 0)
-            largest[message][multiplexer] = max(largest[message][multiplexer], end)
-    layouts = max((math.prod(ends.values()) for ends in largest.values()), default=0)
-    if layouts > _LAYOUTS_MAX or total > _RANGES_SUM_MAX:
-        raise DatabaseError(
-            f"{path}: SG_MUL_VAL_ asks for {layouts} frame layouts, expected at most {_LAYOUTS_MAX}"
-        )
-
-
-def _parse(path: Path, text: str) -> list[CantoolsMessage]:
-    _refuse_excess(path, text)
-    try:
-        parsed = cantools.database.load_string(text, database_format="dbc", strict=True)
-    except (CantoolsError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise DatabaseError(f"{path}: not a usable DBC: {reason[:300]}") from None
-    return cast("CantoolsDatabase", parsed).messages
 
 
 def _message(path: Path, message: CantoolsMessage) -> Message:
@@ -277,6 +250,7 @@ def _signal(where: str, signal: CantoolsSignal) -> Signal:
         minimum=_bound(where, signal.name, "minimum", signal.minimum),
         maximum=_bound(where, signal.name, "maximum", signal.maximum),
         unit=signal.unit or "",
+        comment=signal.comment or "",
         choices=MappingProxyType(
             {int(raw): str(name) for raw, name in (signal.choices or {}).items()}
         ),
@@ -423,27 +397,26 @@ def _max_delta(where: str, message: CantoolsMessage, profile: Profile) -> int:
     return value
 
 
-def _refuse_duplicates(path: Path, messages: list[Message]) -> None:
-    names: dict[str, str] = {}
-    ids: dict[tuple[bool, int], str] = {}
-    identities: dict[Identity, str] = {}
+def _duplicates(messages: Sequence[Message]) -> dict[str, str]:
+    """Messages that share a name, an id or a data id with another, each with the reason."""
+    found: dict[str, str] = {}
+    names: dict[str, Message] = {}
+    ids: dict[tuple[int, bool], Message] = {}
+    identities: dict[Identity, Message] = {}
     for message in messages:
-        if message.name in names:
-            raise DatabaseError(f"{path}: message {message.name} is given twice")
-        names[message.name] = message.name
-        other = ids.setdefault((message.is_extended, message.arbitration_id), message.name)
-        if other != message.name:
-            raise DatabaseError(
-                f"{path}: messages {other} and {message.name} have the same id "
-                f"{message.arbitration_id:#x}"
-            )
+        if names.setdefault(message.name, message) is not message:
+            found[f"message {message.name}"] = "is given twice"
+        other = ids.setdefault(message.key, message)
+        if other is not message:
+            why = f"{other.name} and {message.name} have the same id {message.arbitration_id:#x}"
+            found |= {f"message {item.name}": why for item in (other, message)}
         if message.protection is None:
             continue
-        other = identities.setdefault(message.protection.identity, message.name)
-        if other != message.name:
-            raise DatabaseError(
-                f"{path}: messages {other} and {message.name} have the same E2EDataIds"
-            )
+        other = identities.setdefault(message.protection.identity, message)
+        if other is not message:
+            why = f"{other.name} and {message.name} have the same E2EDataIds"
+            found |= {f"message {item.name}": why for item in (other, message)}
+    return found
 
 
 def _with_foreign_identities(messages: list[Message]) -> list[Message]:

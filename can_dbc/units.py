@@ -65,7 +65,7 @@ def si_conversion(unit: str, dimension: Dimension) -> SiConversion:
         DatabaseError: The unit is missing, unknown, or of another dimension. The message does
             not know the signal; the caller puts its name in front.
     """
-    text = unit.strip()
+    text = unit.rpartition(":")[2].strip()  # some write `distance:mm`
     if dimension is Dimension.NUMBER and text in {"", "-", "1"}:
         return IDENTITY
     expected = f"expected {dimension.name.lower()} in a unit such as {dimension.value}"

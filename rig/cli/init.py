@@ -1,37 +1,305 @@
 """`rig init`."""
 
+import os
+import sys
+import tempfile
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import print_text, refuse_existing
+from rig.cli.progress import progress_line, stoppable
+from rig.cli.terminal import (
+    Bitrate,
+    Channel,
+    Interface,
+    JsonFlag,
+    print_json,
+    print_text,
+    refuse_existing,
+)
 
-EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig zero my.yaml --length-m 0.36`"
+if TYPE_CHECKING:
+    from can_dbc.database import Database
+    from rig.new_bench.first_model import FirstModel, LinearFit
+    from rig.new_bench.proposal import Proposal, Signals
+
+EXAMPLES = (
+    "Examples: `rig init --dbc my.dbc --out my.yaml`, which asks for the rest · `rig init --dbc "
+    "my.dbc --out my.yaml --mass-kg 24 --length-at-rest-m 0.36 --stiffness-n-per-m 9000` · with "
+    "stiffness and damping from ten seconds of motion on the bus: `--listen-s 10` · from a "
+    "recording: `--run sweep.csv`"
+)
+
+_NONE = "none"
+"""Instead of a signal's name: the bench does not measure it."""
+
+_ROUGH_HZ = 2.0
+"""Natural frequency of the model by which a recording is read: it has no effect on what is read."""
+
+Named = Annotated[str | None, typer.Option(metavar="MESSAGE.SIGNAL")]
 
 
 def init(
     dbc: Annotated[Path, typer.Option(metavar="FILE", help="DBC of the bench's bus.")],
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="New file in the DBC's folder; printed if absent."),
+        Path, typer.Option(metavar="FILE", help="New configuration; its model stands beside it.")
+    ],
+    height: Annotated[
+        str | None,
+        typer.Option(metavar="MESSAGE.SIGNAL", help="The height, if not the likeliest signal."),
     ] = None,
+    applied_force: Annotated[
+        str | None,
+        typer.Option(metavar="MESSAGE.SIGNAL", help="Force on the body, or `none`."),
+    ] = None,
+    load_cell: Annotated[
+        str | None,
+        typer.Option(metavar="MESSAGE.SIGNAL", help="Force measured in the strut, or `none`."),
+    ] = None,
+    is_dyno: Annotated[
+        bool, typer.Option("--dyno", help="The bench prescribes the strut's motion.")
+    ] = False,
+    mass_kg: Annotated[
+        float | None,
+        typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries."),
+    ] = None,
+    length_at_rest_m: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest."),
+    ] = None,
+    stiffness_n_per_m: Annotated[
+        float | None,
+        typer.Option(metavar="N/M", min=1e-3, max=1e9, help="Stiffness, from a catalogue."),
+    ] = None,
+    damping_n_s_per_m: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N.S/M", min=0.0, max=1e8, help="Damping; a damping ratio of 0.2 if absent."
+        ),
+    ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN", help="Stiffness and damping from a run's folder or a CSV file."
+        ),
+    ] = None,
+    listen_s: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."),
+    ] = None,
+    interface: Interface = "socketcan",
+    channel: Channel = "can0",
+    bitrate: Bitrate = 500_000,
+    as_json: JsonFlag = False,
 ) -> None:
-    """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""
-    from can_dbc.database import load_database
-    from rig.plan.proposal import propose
+    """Propose a configuration and a first model for a bench whose bus a DBC describes.
 
-    text = propose(load_database(dbc))
-    if out is None:
-        typer.echo(text, nl=False)
+    Signals are ranked by unit, name, comment, range, step and cycle; the configuration states why
+    each was chosen and what else it may be. What the options leave open is asked for in a terminal.
+    """
+    from can_dbc.database import load_database
+    from rig.new_bench.proposal import Bus, Proposal
+
+    model_file = out.with_name(f"{out.stem}_model.yaml")
+    refuse_existing(out, model_file, option="--out ")
+    if run is not None and listen_s is not None:
+        raise InputError("expected one of --run and --listen-s")
+    database = load_database(dbc)
+    signals = _find_signals(database, height, applied_force, load_cell, is_dyno=is_dyno)
+    proposal = Proposal(database, signals, Bus(interface, channel, bitrate), is_dyno)
+    mass_kg = _known(
+        mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
+    )
+    length_at_rest_m = _known(
+        length_at_rest_m, "--length-at-rest-m", "Length of the strut at rest, by a rule, m", None
+    )
+    if run is None and listen_s is None:
+        stiffness_n_per_m = _known(
+            stiffness_n_per_m, "--stiffness-n-per-m", "Stiffness, roughly, N/m", None
+        )
+    model, source = _first_model(mass_kg, length_at_rest_m, stiffness_n_per_m, damping_n_s_per_m)
+    if run is not None or listen_s is not None:
+        fit = _measure(proposal, model, run, listen_s)
+        model = replace(
+            model,
+            stiffness_n_per_m=fit.stiffness_n_per_m,
+            damping_n_s_per_m=fit.damping_n_s_per_m,
+        )
+        source = f"from {'the bus' if run is None else run}, explaining {fit.explained:.0%} of it"
+    _write(proposal, out, model_file, model, source)
+    if as_json:
+        print_json(_as_dict(out, model_file, database, signals, model))
         return
-    refuse_existing(out, option="--out ")
-    if out.resolve().parent != dbc.resolve().parent:
-        raise InputError(f"--out {out}: expected a file in the folder of {dbc}")
+    _print(out, model_file, database, signals, model, source)
+
+
+def _known(value: float | None, option: str, question: str, default: float | None) -> float:
+    """A number that an option gave, or that is asked for in a terminal."""
+    if value is not None:
+        return value
+    if default is not None:
+        return default
+    if not sys.stdin.isatty():
+        raise InputError(f"{option}: required: {question}")
+    answer = float(typer.prompt(question, type=float))
+    if not 0.0 < answer < 1e9:
+        raise InputError(f"{question}: {answer:g}, expected a positive number")
+    return answer
+
+
+def _find_signals(
+    database: "Database",
+    height: str | None,
+    applied_force: str | None,
+    load_cell: str | None,
+    *,
+    is_dyno: bool,
+) -> "Signals":
+    from rig.new_bench.proposal import (
+        Force,
+        Signals,
+        find_force,
+        find_height,
+        find_temperature,
+        unclear_forces,
+    )
+
+    found = find_height(database, height)
+    names = {
+        Force.APPLIED: _NONE if is_dyno and applied_force is None else applied_force,
+        Force.IN_STRUT: load_cell,
+    }
+    forces = {
+        force: None if name == _NONE else find_force(database, force, name)
+        for force, name in names.items()
+    }
+    open_forces = [force for force, name in names.items() if name is None and not forces[force]]
+    unclear = unclear_forces(database, [it for it in forces.values() if it]) if open_forces else []
+    if unclear and sys.stdin.isatty():
+        for item in unclear[: len(open_forces)]:
+            answer = typer.prompt(
+                f"{item.name} is a force: applied to the body, in the strut, or neither? (a/s/n)"
+            )
+            force = {"a": Force.APPLIED, "s": Force.IN_STRUT}.get(str(answer).strip().lower()[:1])
+            if force in open_forces:
+                forces[force] = find_force(database, force, item.name)
+        unclear = []
+    chosen = tuple(choice for choice in forces.values() if choice is not None)
+    if is_dyno and not any(choice.quantity is Force.IN_STRUT.quantity for choice in chosen):
+        raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
+    temperature = find_temperature(database, found.message.sender)
+    return Signals(found, chosen, temperature, tuple(unclear))
+
+
+def _first_model(
+    mass_kg: float, rest_m: float, stiffness_n_per_m: float | None, damping_n_s_per_m: float | None
+) -> "tuple[FirstModel, str]":
+    from rig.new_bench.first_model import FirstModel, rough_damping_n_s_per_m
+
+    stiffness = stiffness_n_per_m or mass_kg * (6.2832 * _ROUGH_HZ) ** 2
+    if damping_n_s_per_m is None:
+        damping, source = rough_damping_n_s_per_m(mass_kg, stiffness), "its damping a guess"
+    else:
+        damping, source = damping_n_s_per_m, "from a catalogue"
+    return FirstModel(mass_kg, rest_m, stiffness, damping), source
+
+
+def _write(
+    proposal: "Proposal", config: Path, model_file: Path, model: "FirstModel", source: str
+) -> None:
+    """Write configuration and model; neither is there if one cannot be written."""
+    dbc = os.path.relpath(proposal.database.path, config.parent)
     try:
-        out.write_text(text, "utf-8")
+        model_file.write_text(model.text(config.stem, source), "utf-8")
+        config.write_text(proposal.text(dbc, model_file.name), "utf-8")
     except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    print_text(f"Written: {out}. Read it, and set bus and model.")
-    print_text(f"Next, with the strut's length now: `rig zero {out} --length-m LENGTH`")
+        model_file.unlink(missing_ok=True)
+        raise InputError(f"--out {config}: cannot be written: {error.strerror}") from error
+
+
+def _measure(
+    proposal: "Proposal", model: "FirstModel", run: Path | None, listen_s: float | None
+) -> "LinearFit":
+    """Linear spring and damper from a recording, or from the bench as it moves now."""
+    from rig.new_bench.first_model import fit_linear
+    from rig.recordings.read import read_recording
+
+    with tempfile.TemporaryDirectory() as folder:
+        recording = read_recording(
+            _listen(proposal, model, listen_s or 0.0, Path(folder)) if run is None else run
+        )
+    force = recording.applied_force_n
+    try:
+        return fit_linear(recording.t_s, recording.heights_m[:, 0], force, model.mass_kg)
+    except InputError as error:
+        raise InputError(f"{recording.name}: {error}") from error
+
+
+def _listen(proposal: "Proposal", model: "FirstModel", listen_s: float, folder: Path) -> Path:
+    """Record the bus as proposed; returns the run's folder."""
+    from rig.plan.load import load_plan
+    from rig.run.loop import RunControl
+    from rig.sensors.mounting import listen
+
+    config, run = folder / "rig.yaml", folder / "run"
+    _write(proposal, config, config.with_name("model.yaml"), model, "to listen by")
+    with stoppable() as stop, progress_line(listen_s) as progress:
+        control = RunControl(stop=stop, progress=progress)
+        listen(load_plan(config), listen_s, run, control)
+    return run
+
+
+def _as_dict(
+    out: Path, model_file: Path, database: "Database", signals: "Signals", model: "FirstModel"
+) -> dict[str, object]:
+    return {
+        "config": str(out),
+        "model": str(model_file),
+        "signals": {
+            choice.quantity.key: {
+                "message": choice.message.name,
+                "signal": choice.signal.name,
+                "why": choice.why,
+                "others": list(choice.others),
+            }
+            for choice in signals.choices
+        },
+        "unclear_forces": [item.name for item in signals.unclear],
+        "mass_kg": model.mass_kg,
+        "length_at_rest_m": model.rest_m,
+        "free_length_m": model.free_length_m,
+        "stiffness_n_per_m": model.stiffness_n_per_m,
+        "damping_n_s_per_m": model.damping_n_s_per_m,
+        "passed_over": dict(database.passed_over),
+    }
+
+
+def _print(
+    out: Path,
+    model_file: Path,
+    database: "Database",
+    signals: "Signals",
+    model: "FirstModel",
+    source: str,
+) -> None:
+    for choice in signals.choices:
+        print_text(f"{choice.quantity.key}: {choice.name} ({choice.comment})")
+    for item in signals.unclear:
+        print_text(
+            f"{item.name} is a force, and nothing says where it acts: --applied-force {item.name} "
+            f"for one on the body, --load-cell {item.name} for one in the strut"
+        )
+    for what, why in database.passed_over.items():
+        print_text(f"Passed over in {database.path.name}: {what}: {why}")
+    print_text(
+        f"Model: {model.mass_kg:g} kg, stiffness {model.stiffness_n_per_m:.4g} N/m, damping "
+        f"{model.damping_n_s_per_m:.4g} N·s/m ({source}), free length {model.free_length_m:.4g} m"
+    )
+    print_text(f"Written: {out}, {model_file}. Read them.")
+    print_text(
+        f"Next, with the bench at rest: `rig zero {out} --length-m {model.rest_m:g}`, or another "
+        "length that you measure now"
+    )

@@ -125,6 +125,15 @@ def _run_one(
         print_text(f"Next: `rig diagnose {folder} --model {folder}/model.yaml --out diagnosis`")
 
 
+def _why(ended: "Ended") -> str:
+    """Why a run is in its safe state, in brackets."""
+    cause = ended.state.supervised.cause
+    if cause is None:
+        return ""
+    value = f", {cause.quantity} {cause.value:.4g} beyond {cause.limit:.4g}" * bool(cause.quantity)
+    return f" ({cause.event.value}{value}; events.jsonl has what led there)"
+
+
 def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
     from rig.bridge.values import Mode
 
@@ -136,7 +145,7 @@ def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
         )
         raise typer.Exit(FAILED)
     if ended.state.mode is Mode.SAFE:
-        stderr.print("The run ended in its safe state.", style="red")
+        stderr.print(f"The run ended in its safe state{_why(ended)}.", style="red")
         raise typer.Exit(FAILED)
     if ended.dropped_steps:
         stderr.print(

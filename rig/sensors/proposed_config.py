@@ -14,7 +14,7 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from can_dbc.units import Dimension
 from rig.bus.bus import BusConfig
-from rig.plan.proposal import propose_observer
+from rig.new_bench.proposal import propose_observer
 from rig.sensors.bus_scan import BusSurvey
 from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
 from rig.sensors.j1939 import LARGEST_VALUE, AddressClaim, GroupMessage

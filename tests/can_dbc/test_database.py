@@ -107,45 +107,21 @@ SECOND = other(
 @pytest.mark.parametrize(
     ("messages", "statements", "words"),
     [
-        (OVERLAP, "", ["overlapping"]),
-        (TOO_LONG, "", ["does not fit"]),
-        (HIDDEN, "", ["signal A", "does not fit"]),
         (HUGE, "", ["4000000000 bytes"]),
         (FAR, "", ["does not fit"]),
-        (SAME_ID, "", ["FAST and O", "0x123"]),
-        (SAME_NAME, "", ["FAST", "twice"]),
-        (WIDE_ID, "", ["message O"]),
-        (INFINITE, "", ["signal A", "scale", "finite"]),
         ("BO_ what", "", ["not a usable DBC"]),
+        (
+            GOOD.split("BO_ 2147484672", maxsplit=1)[0] + "BO_ 291 O: 8 RIG",
+            "",
+            ["FAST and O", "0x123"],
+        ),
         (GOOD, "SG_MUL_VAL_ 291 TRAVEL CRC 0-4294967295;", ["SG_MUL_VAL_"]),
         (
             GOOD,
             "SG_MUL_VAL_ 291 COUNTER CRC 0-9999;\nSG_MUL_VAL_ 291 TRAVEL COUNTER 0-9999;",
             ["SG_MUL_VAL_", "100000000 frame layouts"],
         ),
-        (GOOD, 'BA_ "E2EProfile" BO_ 291 "P99";', ["FAST", "'P99'", "P01, P02"]),
-        (GOOD, 'BA_ "E2EProfile" BO_ 291 "P02";', ["FAST", "E2EDataIds", "16 bytes in hex"]),
-        (
-            GOOD,
-            'BA_ "E2EProfile" BO_ 291 "P01";\nBA_ "E2EDataIds" BO_ 291 "12345";',
-            ["E2EDataIds '12345'", "2 bytes in hex"],
-        ),
-        (
-            GOOD,
-            FAST_P02 + 'BA_ "E2ECrcSignal" BO_ 291 "CHECK";',
-            ["FAST", "E2ECrcSignal 'CHECK'", "no such signal"],
-        ),
-        (
-            GOOD,
-            FAST_P02 + 'BA_ "E2ECounterSignal" BO_ 291 "TRAVEL";',
-            ["E2ECounterSignal 'TRAVEL'", "4 bits from bit 8"],
-        ),
-        (GOOD, FAST_P02 + 'BA_ "E2EMaxDeltaCounter" BO_ 291 16;', ["16", "1 to 15"]),
-        (
-            SECOND,
-            FAST_P02 + FAST_P02.replace("291", "5"),
-            ["FAST and O", "same E2EDataIds"],
-        ),
+        (GOOD, "SIG_VALTYPE_ 291 TRAVEL of : 1;", ["not a usable DBC", "SIG_VALTYPE_"]),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(
@@ -157,6 +133,71 @@ def test_a_wrong_file_is_refused_in_one_line(
     for word in [str(path), *words]:
         assert word in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("messages", "statements", "name", "words"),
+    [
+        (OVERLAP, "", "O", ["overlapping"]),
+        (TOO_LONG, "", "O", ["does not fit"]),
+        (HIDDEN, "", "O", ["signal A", "does not fit"]),
+        (SAME_ID, "", "O", ["FAST and O", "0x123"]),
+        (SAME_ID, "", "FAST", ["FAST and O", "0x123"]),
+        (SAME_NAME, "", "FAST", ["twice"]),
+        (WIDE_ID, "", "O", ["message O"]),
+        (INFINITE, "", "O", ["signal A", "scale", "finite"]),
+        (GOOD, 'BA_ "E2EProfile" BO_ 291 "P99";', "FAST", ["'P99'", "P01, P02"]),
+        (GOOD, 'BA_ "E2EProfile" BO_ 291 "P02";', "FAST", ["E2EDataIds", "16 bytes in hex"]),
+        (
+            GOOD,
+            'BA_ "E2EProfile" BO_ 291 "P01";\nBA_ "E2EDataIds" BO_ 291 "12345";',
+            "FAST",
+            ["E2EDataIds '12345'", "2 bytes in hex"],
+        ),
+        (
+            GOOD,
+            FAST_P02 + 'BA_ "E2ECrcSignal" BO_ 291 "CHECK";',
+            "FAST",
+            ["E2ECrcSignal 'CHECK'", "no such signal"],
+        ),
+        (
+            GOOD,
+            FAST_P02 + 'BA_ "E2ECounterSignal" BO_ 291 "TRAVEL";',
+            "FAST",
+            ["E2ECounterSignal 'TRAVEL'", "4 bits from bit 8"],
+        ),
+        (GOOD, FAST_P02 + 'BA_ "E2EMaxDeltaCounter" BO_ 291 16;', "FAST", ["16", "1 to 15"]),
+        (
+            SECOND,
+            FAST_P02 + FAST_P02.replace("291", "5"),
+            "O",
+            ["FAST and O", "same E2EDataIds"],
+        ),
+    ],
+)
+def test_a_wrong_message_is_refused_in_one_line_and_the_others_are_read(
+    write_dbc: Callable[..., Path], messages: str, statements: str, name: str, words: list[str]
+) -> None:
+    path = write_dbc(messages, statements)
+    database = load_database(path)
+    with pytest.raises(DatabaseError) as caught:
+        database.message(name)
+    for word in [f"{path}: message {name}: ", *words]:
+        assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert database.message("BIG").signal("FORCE").unit == "lbf"
+
+
+def test_what_only_describes_is_passed_over(write_dbc: Callable[..., Path]) -> None:
+    values = 'VAL_ 291 NOWHERE 0 "off" ;\nVAL_ 291 COUNTER 0 "first" ;'
+    database = load_database(write_dbc(GOOD, values))
+    assert dict(database.passed_over) == {"VAL_ 291 NOWHERE": "no such signal"}
+    assert database.message("FAST").signal("COUNTER").choices == {0: "first"}
+    # A comment that cannot be read takes comments and names with it; cycle and units stay.
+    text = 'CM_ SG_ 291 "of which signal?";\nBA_ "GenMsgCycleTime" BO_ 291 5;'
+    database = load_database(write_dbc(GOOD, text))
+    assert list(database.passed_over) == ["value names, comments and attributes"]
+    assert database.message("FAST").cycle_time_ns == 5_000_000
 
 
 def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

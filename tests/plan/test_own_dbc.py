@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.values import Mode
@@ -19,7 +18,6 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.preflight_checks import Severity, check, errors
-from rig.plan.proposal import propose
 from rig.recordings.run_folder import _samples
 from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
@@ -27,6 +25,7 @@ from rig.run.ports import BusPort
 from rig.run.replay import replay
 from tests.bridge.cores import FIRST
 from tests.bus_and_log.at_once import AtOnce
+from tests.new_bench.proposing import propose
 
 MS = 1_000_000
 
@@ -59,46 +58,9 @@ def dbc(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_proposal_finds_height_temperature_and_where_to_publish(dbc):
-    text = propose(load_database(dbc))
-    assert yaml.safe_load(text) == {
-        "model": "reference",
-        "dbc": "my.dbc",
-        "bus": {"interface": "socketcan", "channel": "can0", "bitrate": 500000},
-        "signals": {
-            "height": {"message": "SENSOR_1", "signal": "Travel"},
-            "temperature": {"message": "SENSOR_1", "signal": "OilTemp"},
-        },
-        "publish": {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}},
-        "observers": {
-            "strut": {
-                "kind": "kalman",
-                # A tenth of a radian an interval of 1 ms, steps of 0.05 mm over the root of 12.
-                "filter": {"bandwidth_hz": 15.92, "noise_std_m": 1.443e-5},
-            }
-        },
-        "supervision": {
-            "stale_after_s": 0.01,
-            "safe_after_s": 0.5,
-            "limits": [
-                {"value": "measured_rate_m_per_s", "low": -10, "high": 10, "action": "refuse"},
-                {"value": "unchanged_s", "high": 1, "action": "hold"},
-            ],
-        },
-    }
-    assert "unsafe: {publish_without_valid: true}" in text
-    assert "or CONTROL_1.Setpoint" in text
-
-
-def test_a_dbc_without_a_length_gives_no_proposal(dbc):
-    dbc.write_text(DBC.replace('"mm"', '""'))
-    with pytest.raises(InputError, match=r"my\.dbc: no signal has a unit of length"):
-        propose(load_database(dbc))
-
-
 def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     config = tmp_path / "my.yaml"
-    text = propose(load_database(dbc)).replace("interface: socketcan", "interface: virtual")
+    text = propose(dbc).replace("interface: socketcan", "interface: virtual")
     text = text.replace("channel: can0", "channel: own-dbc")
     lines = [line for line in text.splitlines() if "temperature" not in line]
     config.write_text("\n".join([*lines, "unsafe: {publish_without_valid: true}"]))
@@ -149,45 +111,9 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     assert (found.logged, found.different) == (300, 0)
 
 
-def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
-    text = DBC.replace(
-        "BO_ 400",
-        "BO_ 300 SENSOR_2: 8 SENSOR\n"
-        ' SG_ SetForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
-    )
-    dbc.write_text(text)
-    published = yaml.safe_load(propose(load_database(dbc)))["publish"]
-    assert published == {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}}
-
-
-def test_the_packages_own_dbc_gives_its_own_estimate():
-    proposed = yaml.safe_load(propose(load_database(DEFAULT_DATABASE)))
-    assert proposed["publish"] == {
-        "force": {"message": "RIG_ESTIMATE", "signal": "SPRING_DAMPER_FORCE"},
-        "valid": {"message": "RIG_ESTIMATE", "signal": "VALID"},
-    }
-    assert proposed["status"] == "RIG_STATUS"
-
-
-def test_a_signal_that_says_valid_and_one_of_the_mode_are_proposed(dbc, tmp_path):
-    dbc.write_text(
-        DBC.replace(
-            " SG_ Setpoint",
-            ' SG_ ForceOk : 40|1@0+ (1,0) [0|1] "" SENSOR\n'
-            ' SG_ BridgeState : 55|4@0+ (1,0) [0|15] "" SENSOR\n SG_ Setpoint',
-        )
-    )
-    text = propose(load_database(dbc))
-    proposed = yaml.safe_load(text)
-    assert proposed["publish"]["valid"] == {"message": "CONTROL_1", "signal": "ForceOk"}
-    assert proposed["status"] == {"state": {"message": "CONTROL_1", "signal": "BridgeState"}}
-    (tmp_path / "my.yaml").write_text(text)
-    assert not errors(load_plan(tmp_path / "my.yaml"))
-
-
 def test_a_force_without_valid_is_an_error_that_the_user_may_take_upon_themselves(dbc, tmp_path):
     path = tmp_path / "my.yaml"
-    path.write_text(propose(load_database(dbc)))
+    path.write_text(propose(dbc))
     (found,) = errors(load_plan(path))
     assert found.what == "publish.strut"
     assert "expected publish.valid, or unsafe: {publish_without_valid: true}" in found.text
@@ -200,9 +126,7 @@ def test_a_force_without_valid_is_an_error_that_the_user_may_take_upon_themselve
 
 def test_a_frozen_height_is_no_estimate_as_it_was_proposed(dbc, tmp_path):
     """The measured height stays the same for longer than a sensor's noise allows."""
-    (tmp_path / "my.yaml").write_text(
-        propose(load_database(dbc)) + "unsafe: {publish_without_valid: true}\n"
-    )
+    (tmp_path / "my.yaml").write_text(propose(dbc) + "unsafe: {publish_without_valid: true}\n")
     bridge = build_bridge(load_plan(tmp_path / "my.yaml"))
     encode = cantools.database.load_file(dbc).encode_message
     state, modes = bridge.init(0), []
@@ -224,7 +148,7 @@ VALID_DBC = DBC.replace(
 def with_valid(folder, valid):
     """A configuration whose height has a signal that says whether it is valid."""
     (folder / "my.dbc").write_text(VALID_DBC)
-    config = yaml.safe_load(propose(load_database(folder / "my.dbc")))
+    config = yaml.safe_load(propose(folder / "my.dbc"))
     config["signals"]["height"]["valid"] = valid
     config["unsafe"] = {"publish_without_valid": True}
     path = folder / "my.yaml"

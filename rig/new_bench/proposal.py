@@ -1,0 +1,456 @@
+"""A configuration proposed from a DBC: which signals look like what the bridge needs.
+
+What is proposed is safe to start with: an observer that is slow and stable until it is tuned, a
+signal that marks the estimate as invalid, and limits on what a height sensor can send.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from can_dbc.codec import si_step
+from can_dbc.database import Database, Message, Signal, alive_counter
+from can_dbc.errors import DatabaseError, InputError, expected_name
+from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
+from rig.channels.measured_quantities import (
+    APPLIED_FORCE,
+    HEIGHT,
+    LOAD_CELL_FORCE,
+    TEMPERATURE,
+    Quantity,
+)
+from rig.new_bench import signal_ranking
+from rig.new_bench.signal_ranking import (
+    LIKELY,
+    Likeness,
+    RankedSignal,
+    measures,
+    rank_signals,
+    words_without_unit,
+)
+from rig.observers.kalman import KalmanObserver
+
+STRUT = "strut"
+"""Strut of the model that is proposed."""
+
+_UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
+"""Where the DBC does not state a step or a cycle."""
+
+_LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
+"""Rates of the bridge: that of the height where it lies between, else the usual one."""
+
+_VALID_WORDS, _OK_CHOICES = ("valid", "gueltig", "qual", "ok"), ("ok", "valid", "good", "gueltig")
+_FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
+_COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount")
+_STATE_WORDS = ("state", "mode", "status", "zustand")
+_LEAST_STATE_BITS = 3
+"""A mode is a number from 0 to 6."""
+
+_STALE_CYCLES = 3
+"""Cycles after which a height is stale: two frames in a row may be lost."""
+
+_LEAST_STALE_S = 0.01
+_LARGEST_RATE_M_PER_S = 10.0
+"""Of a height: several times what a damper is tested at."""
+
+_FROZEN_S = 1.0
+"""A reading that is the same for longer is taken for frozen: noise changes it in some samples."""
+
+_MOST_OTHERS = 4
+"""Other candidates that are named in a comment."""
+
+
+class Force(Enum):
+    """Where a force acts that the bench measures."""
+
+    APPLIED = APPLIED_FORCE
+    IN_STRUT = LOAD_CELL_FORCE
+
+    @property
+    def quantity(self) -> Quantity:
+        """Its quantity."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A signal that was chosen for a quantity, with the others that may be it.
+
+    Attributes:
+        why: Why it was chosen.
+    """
+
+    quantity: Quantity
+    message: Message
+    signal: Signal
+    why: str
+    others: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Message and signal, with a dot between."""
+        return f"{self.message.name}.{self.signal.name}"
+
+    @property
+    def comment(self) -> str:
+        """Why, and what else it may be."""
+        others = ", ".join(self.others[:_MOST_OTHERS])
+        more = ", ..." if len(self.others) > _MOST_OTHERS else ""
+        return self.why + (f"; or {others}{more}" if others else "")
+
+
+@dataclass(frozen=True)
+class Signals:
+    """What is measured on a bench, by signals of its DBC.
+
+    Attributes:
+        unclear: Forces of which nothing says whether they act on the body or in the strut.
+    """
+
+    height: Choice
+    forces: tuple[Choice, ...]
+    temperature: Choice | None
+    unclear: tuple[RankedSignal, ...] = ()
+
+    @property
+    def choices(self) -> tuple[Choice, ...]:
+        """All of them."""
+        last = () if self.temperature is None else (self.temperature,)
+        return (self.height, *self.forces, *last)
+
+    def measures(self, force: Force) -> bool:
+        """Whether a force is measured there."""
+        return any(choice.quantity is force.quantity for choice in self.forces)
+
+
+def find_height(database: Database, named: str | None) -> Choice:
+    """The signal that is the height, by its name (`MESSAGE.SIGNAL`) or the likeliest one.
+
+    Raises:
+        InputError: There is no such signal, or none that looks like the height of a strut.
+    """
+    messages = list(database.messages.values())
+    ranked = rank_signals(messages, signal_ranking.HEIGHT)
+    if named is not None:
+        return _named(database, HEIGHT, named, ranked, "--height")
+    if not ranked:
+        unitless = words_without_unit(messages, signal_ranking.HEIGHT)
+        raise InputError(
+            f"{database.path}: no signal has a unit of length, expected the height of a strut"
+            + (
+                f": if it is {' or '.join(unitless[:_MOST_OTHERS])}, give it its unit in the DBC"
+                if unitless
+                else ""
+            )
+        )
+    if ranked[0].score < LIKELY:
+        lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
+        more = ", ..." if len(ranked) > _MOST_OTHERS else ""
+        raise InputError(
+            f"{database.path}: no length looks like the height of a strut (there are {lengths}"
+            f"{more}): name it with --height MESSAGE.SIGNAL"
+        )
+    return _choice(HEIGHT, ranked[0], ranked)
+
+
+def find_force(database: Database, force: Force, named: str | None) -> Choice | None:
+    """The signal of a force, by its name or if its name or comment says where it acts.
+
+    Raises:
+        InputError: There is no such signal.
+    """
+    likeness = _force_likeness(force)
+    ranked = rank_signals(database.messages.values(), likeness)
+    if named is not None:
+        option = f"--{force.quantity.key.removesuffix('_force').replace('_', '-')}"
+        return _named(database, force.quantity, named, ranked, option)
+    likely = [item for item in ranked if item.score >= LIKELY]
+    return _choice(force.quantity, likely[0], likely) if likely else None
+
+
+def unclear_forces(database: Database, taken: Iterable[Choice]) -> list[RankedSignal]:
+    """Measured forces of which nothing says where they act, the likeliest first.
+
+    A force that another node could take from the bridge is none of them.
+    """
+    messages = list(database.messages.values())
+    names = {choice.name for choice in taken}
+    names |= {
+        it.name for it in rank_signals(messages, signal_ranking.ESTIMATE) if it.score >= LIKELY
+    }
+    ranked = [
+        sorted(rank_signals(messages, kind), key=lambda item: item.name)
+        for kind in (signal_ranking.APPLIED_FORCE, signal_ranking.STRUT_FORCE)
+    ]
+    found = [max(same, key=lambda item: item.score) for same in zip(*ranked, strict=True)]
+    free = [item for item in found if item.name not in names and -1.0 < item.score < LIKELY]
+    return sorted(free, key=lambda item: -item.score)
+
+
+def find_temperature(database: Database, sender: str | None) -> Choice | None:
+    """The temperature of the damper: clearly named, or measured by the sender of the height."""
+    ranked = rank_signals(database.messages.values(), signal_ranking.TEMPERATURE)
+    likely = [
+        item
+        for item in ranked
+        if item.score >= LIKELY or (item.score > 0.0 and item.message.sender == sender)
+    ]
+    return _choice(TEMPERATURE, likely[0], likely) if likely else None
+
+
+def _force_likeness(force: Force) -> Likeness:
+    return signal_ranking.APPLIED_FORCE if force is Force.APPLIED else signal_ranking.STRUT_FORCE
+
+
+def _named(
+    database: Database, quantity: Quantity, name: str, ranked: Sequence[RankedSignal], option: str
+) -> Choice:
+    message_name, dot, signal_name = name.partition(".")
+    if not dot:
+        raise InputError(f"{option} {name}: expected MESSAGE.SIGNAL")
+    message = database.message(message_name)
+    signal = message.signal(signal_name)
+    if not measures(signal, quantity.dimension):
+        names = [item.name for item in ranked]
+        raise InputError(
+            f"{option} {name}: has the unit {signal.unit!r}, expected one of "
+            f"{quantity.dimension.name.lower()}"
+            + (f": {expected_name(name, names)}" if names else "")
+        )
+    return Choice(quantity, message, signal, "as named", ())
+
+
+def _choice(quantity: Quantity, best: RankedSignal, ranked: Sequence[RankedSignal]) -> Choice:
+    others = tuple(item.name for item in ranked if item is not best)
+    return Choice(quantity, best.message, best.signal, best.why, others)
+
+
+@dataclass(frozen=True)
+class Bus:
+    """How the bus is opened."""
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = 500_000
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What a bench's configuration is made of.
+
+    Attributes:
+        is_motion_prescribed: Whether the bench is a dyno.
+    """
+
+    database: Database
+    signals: Signals
+    bus: Bus
+    is_motion_prescribed: bool
+
+    def text(self, dbc: str, model: str) -> str:
+        """YAML of the configuration, with the reasons in comments.
+
+        Args:
+            dbc: The DBC's path, from the configuration's folder.
+            model: The model's path, likewise.
+        """
+        signals, bus = self.signals, self.bus
+        message, signal = signals.height.message, signals.height.signal
+        observer = (
+            ["prescribed_motion: {settling_s: 0.002}   # a dyno: the bench moves the strut"]
+            if self.is_motion_prescribed
+            else propose_observer(
+                si_step(message, signal.name, HEIGHT.dimension), message.cycle_time_ns
+            )
+        )
+        lines = [
+            f"# Proposed from {self.database.path.name}: read it before a bench moves.",
+            *_rate(message.cycle_time_ns),
+            f"model: {model}",
+            f"dbc: {dbc}",
+            f"bus: {{interface: {bus.interface}, channel: {bus.channel}, bitrate: {bus.bitrate}}}",
+            "signals:",
+            *(line for choice in signals.choices for line in _signal_lines(choice)),
+            *(
+                f"  # {item.name}: a force; applied_force (on the body) or load_cell_force?"
+                for item in signals.unclear[:_MOST_OTHERS]
+            ),
+            *_propose_publish(self.database, signals),
+            *observer,
+            *_supervision(signals),
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def _rate(interval_ns: int | None) -> list[str]:
+    rate_hz = None if interval_ns is None else 1e9 / interval_ns
+    if rate_hz is None or not _LEAST_RATE_HZ <= rate_hz <= _LARGEST_RATE_HZ:
+        return [f"rate_hz: {_USUAL_RATE_HZ:g}"]
+    return [f"rate_hz: {rate_hz:g}   # that of the height"]
+
+
+def _signal_lines(choice: Choice) -> list[str]:
+    keys = {"message": choice.message.name, "signal": choice.signal.name}
+    entry = ", ".join(f"{key}: {value}" for key, value in (keys | _frame_checks(choice)).items())
+    return [f"  # {choice.comment}", f"  {choice.quantity.key}: {{{entry}}}"]
+
+
+def _frame_checks(choice: Choice) -> dict[str, str]:
+    """Keys of what a message contains about its frames: validity and counter."""
+    found: dict[str, str] = {}
+    message = choice.message
+    valid = _find_flag(message, choice.signal)
+    if valid is not None:
+        name, value = valid
+        found["valid"] = f"{{signal: {name}, value: {value}}}"
+    if message.protection is None:
+        counters = [item for item in message.signals.values() if _is_counter(message, item)]
+        if len(counters) == 1:
+            found["counter"] = counters[0].name
+    return found
+
+
+def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
+    """A signal that says whether a message's values hold, with the value that says they do."""
+    flags = [
+        signal
+        for signal in message.signals.values()
+        if not signal.unit and not signal.is_float and signal.length_bits <= 2
+        if _has_word(signal, _VALID_WORDS) or _has_word(signal, _FAULT_WORDS)
+    ]
+    # The signal's own, or one that belongs to no other signal.
+    own = [item for item in flags if _shares_a_word(item.name, measured.name)]
+    others = [item.name for item in message.signals.values() if item not in (*flags, measured)]
+    common = [it for it in flags if not any(_shares_a_word(it.name, other) for other in others)]
+    chosen = own or common
+    if len(chosen) != 1:
+        return None
+    (flag,) = chosen
+    for raw, text in flag.choices.items():
+        if any(text.lower().startswith(word) for word in _OK_CHOICES):
+            return flag.name, raw
+    return flag.name, 0 if _has_word(flag, _FAULT_WORDS) else 1
+
+
+def _shares_a_word(one: str, other: str) -> bool:
+    return bool(set(signal_ranking.split_name(one)) & set(signal_ranking.split_name(other)))
+
+
+def _has_word(signal: Signal, words: Sequence[str]) -> bool:
+    return any(word in signal.name.lower() for word in words)
+
+
+def _is_counter(message: Message, signal: Signal) -> bool:
+    if signal.unit or not _has_word(signal, _COUNTER_WORDS) or message.cycle_time_ns is None:
+        return False
+    try:
+        alive_counter(message, signal.name)
+    except DatabaseError:
+        return False
+    return True
+
+
+def _propose_publish(database: Database, signals: Signals) -> list[str]:
+    """Lines of what could carry the estimate, its validity and the bridge's mode."""
+    bench = signals.height.message.sender
+    listened = {choice.message.name for choice in signals.choices}
+    messages = [item for item in database.messages.values() if item.name not in listened]
+    # A DBC that names no nodes does not determine who sends what.
+    free = [item for item in messages if item.sender != bench] or messages
+    estimates = [
+        item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.score >= LIKELY
+    ]
+    if not estimates:
+        return [
+            "# publish: no message looks like one for the estimate. Add one to the DBC, with a",
+            "# force and a bit that is 1 while it is valid, then:",
+            "# publish: {force: {message: M, signal: S}, valid: {message: M, signal: V}}",
+        ]
+    best = estimates[0]
+    lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
+    # Where the validity has a message of its own, it is one of the same sender.
+    near = [best.message, *(item for item in free if item is not best.message)]
+    valid = _find_integer(near, _VALID_WORDS, lambda bits: bits >= 1)
+    lines += (
+        [f"  {VALID.key}: {{message: {valid[0].name}, signal: {valid[1].name}}}"]
+        if valid
+        else [
+            "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
+            "  # unsafe: {publish_without_valid: true} accepts that",
+        ]
+    )
+    state = _find_integer(near, _STATE_WORDS, lambda bits: bits >= _LEAST_STATE_BITS)
+    if any(item.name == STATUS_MESSAGE for item in free):
+        lines.append(f"status: {STATUS_MESSAGE}")
+    elif state:
+        entry = f"{{message: {state[0].name}, signal: {state[1].name}}}"
+        lines += ["status:", f"  state: {entry}"]
+    return lines
+
+
+def _publish_line(key: str, best: RankedSignal, found: Sequence[RankedSignal]) -> str:
+    others = [item.name for item in found if item is not best][:_MOST_OTHERS]
+    comment = best.why + (f"; or {', '.join(others)}" if others else "")
+    return f"  {key}: {{message: {best.message.name}, signal: {best.signal.name}}}   # {comment}"
+
+
+def _find_integer(
+    messages: Iterable[Message], words: Sequence[str], fits: Callable[[int], bool]
+) -> tuple[Message, Signal] | None:
+    """The first integer signal without a unit that has one of some words in its name."""
+    found = (
+        (message, signal)
+        for message in messages
+        for signal in sorted(message.signals.values(), key=lambda item: item.length_bits)
+        if not signal.unit and not signal.is_float and fits(signal.length_bits)
+        if _has_word(signal, words)
+    )
+    return next(found, None)
+
+
+def propose_observer(step_m: float, interval_ns: int | None) -> list[str]:
+    """Lines of an observer that is stable until it is tuned.
+
+    Args:
+        step_m: Step of the height; 0 where it is unknown.
+        interval_ns: Time between two heights, if it is known.
+    """
+    noise_std_m = step_m / math.sqrt(12.0) or _UNKNOWN_NOISE_M
+    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns or _UNKNOWN_INTERVAL_NS)
+    found = observer.filter
+    return [
+        "observers:",
+        f"  {STRUT}:   # slow and stable; rig tune finds a better one",
+        f"    kind: {observer.kind}",
+        f"    filter: {{bandwidth_hz: {found.bandwidth_hz:.4g}, "
+        f"noise_std_m: {found.noise_std_m:.3e}}}",
+    ]
+
+
+def _supervision(signals: Signals) -> list[str]:
+    """Lines of ages and limits that follow from the messages."""
+    cycle_s = (signals.height.message.cycle_time_ns or _UNKNOWN_INTERVAL_NS) * 1e-9
+    stale_s = max(_LEAST_STALE_S, _STALE_CYCLES * cycle_s)
+    rate = _LARGEST_RATE_M_PER_S
+    lines = [
+        "supervision:",
+        f"  stale_after_s: {stale_s:g}",
+        f"  safe_after_s: {max(0.5, 5.0 * stale_s):g}",
+        "  limits:",
+        f"    - {{value: measured_rate_m_per_s, low: {-rate:g}, high: {rate:g}, action: refuse}}",
+        "    # A sensor that has frozen; remove the line for one that repeats itself at rest.",
+        f"    - {{value: unchanged_s, high: {_FROZEN_S:g}, action: hold}}",
+    ]
+    if signals.measures(Force.APPLIED):
+        lines += [
+            "    # The same for the applied force, unless it may be constant for longer.",
+            f"    # - {{channel: {APPLIED_FORCE.key}, value: unchanged_s, high: {_FROZEN_S:g}, "
+            "action: hold}",
+        ]
+        if signals.measures(Force.IN_STRUT):
+            lines += [
+                "    # Against a wrong scale or mass: largest difference to the load cell, N.",
+                "    # - {value: force_difference_n, low: -100, high: 100, action: hold}",
+            ]
+    return lines

@@ -1,0 +1,268 @@
+"""Which signals of a DBC are likely to be what a bench measures, best first, with the reasons.
+
+A unit decides what a signal may be. Which of them it is follows from words in its name, its
+comment and its message's name, from its range, its step and its cycle. The words are English and
+German, as DBC files have them; the weights order candidates that were seen in some hundred public
+files, where an odometer, a radar's range and a fuel level are lengths too.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from can_dbc.codec import si_range, si_step
+from can_dbc.database import Message, Signal
+from can_dbc.errors import DatabaseError
+from can_dbc.units import Dimension, si_conversion
+
+_NOT_SENT = "VECTOR__INDEPENDENT_SIG_MSG"
+"""Name under which DBC editors keep signals that belong to no message."""
+
+_ELSEWHERE = 0.5
+"""Weight of a word in a comment or a message's name, of that in the signal's own name."""
+
+_LETTERS_OF_A_PART = 5
+"""A shorter word has to begin one: `pos` is no part of `exposure`, nor `ride` of `override`."""
+
+_CLEAR_WORD = 2.0
+"""Weight of a word that says by itself what a signal is."""
+
+_FAST_S, _SLOW_S = 0.02, 0.2
+"""Cycles of a sensor by which a strut can be followed, and of one by which it cannot."""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What a signal of some quantity looks like.
+
+    Attributes:
+        words: Weights of words in names; negative for what is measured elsewhere.
+        spans: Spans of a range in SI that are usual, that are possible.
+        step: Largest step in SI that is of use.
+    """
+
+    dimension: Dimension
+    words: Mapping[str, float]
+    spans: tuple[tuple[float, float], tuple[float, float]] | None = None
+    step: float | None = None
+
+
+@dataclass(frozen=True)
+class RankedSignal:
+    """A signal that may be what is looked for; the higher its score, the more likely."""
+
+    message: Message
+    signal: Signal
+    score: float
+    reasons: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Message and signal, with a dot between."""
+        return f"{self.message.name}.{self.signal.name}"
+
+    @property
+    def why(self) -> str:
+        """The reasons in one line."""
+        return ", ".join(self.reasons)
+
+
+def _weights(**weighted: str) -> dict[str, float]:
+    """Words by weight: `plus_3="susp damper"`, `minus_4="odo trip"`."""
+    found: dict[str, float] = {}
+    for key, words in weighted.items():
+        sign, _, size = key.partition("_")
+        found |= dict.fromkeys(words.split(), float(size) * (1 if sign == "plus" else -1))
+    return found
+
+
+HEIGHT = Likeness(
+    Dimension.LENGTH,
+    _weights(
+        plus_3="susp suspension damper daempfer shock strut stroke lvdt drawwire linpot federweg "
+        "einfederung federbein ridehgt rideheight ride wire potentiometer pot jounce",
+        plus_2="height hght hoehe travel displacement displ stringpot weg wegsensor level niveau",
+        plus_1="pos position length laenge hub spring feder corner axle achse",
+        minus_4="odo odometer distance dist trip range reichweite altitude gps latitude longitude "
+        "lane radar object obj target curve kurve snow rain urea fuel tank tire tyre circumference "
+        "throttle brake pedal clutch steer steering rack valve camera cam parking obstacle "
+        "pedestrian waypoint path route road gap lateral wheelbase track trk vehicle ahead "
+        "mileage km seat injector crank oil oel attitude cloud visibility width potential",
+        minus_2="offset setpoint soll cmd command request req nominal target demand raw prev "
+        "model estimated simulated",
+    ),
+    spans=((0.005, 2.0), (0.0, 20.0)),
+    step=1e-3,
+)
+
+_NO_BENCH_FORCE = (
+    "brake pedal steer steering handle clutch tractive traction propulsion drag aero wind "
+    "regen wheel trailer drawbar fifthwheel limit max min"
+)
+
+APPLIED_FORCE = Likeness(
+    Dimension.FORCE,
+    _weights(
+        plus_3="applied excitation erreger anregung shaker actuator aktor cylinder zylinder "
+        "exciter input carriage",
+        plus_1="act force kraft drive piston hydraulic servo",
+        minus_2="load cell loadcell strut damper kmd messdose estimate estimated cmd setpoint soll",
+        minus_4=_NO_BENCH_FORCE,
+    ),
+)
+
+STRUT_FORCE = Likeness(
+    Dimension.FORCE,
+    _weights(
+        plus_3="loadcell load cell strut damper daempfer kmd messdose shock susp suspension",
+        plus_1="force kraft meas measured ist sensor",
+        minus_2="applied excitation shaker actuator aktor cylinder zylinder estimate estimated cmd "
+        "setpoint soll carriage",
+        minus_4=_NO_BENCH_FORCE,
+    ),
+)
+
+TEMPERATURE = Likeness(
+    Dimension.TEMPERATURE,
+    _weights(
+        plus_3="damper daempfer oil oel shock strut fluid",
+        plus_1="temp temperature temperatur",
+        minus_2="ambient engine motor battery cell coolant inverter air outside aussen cpu board "
+        "gearbox transmission exhaust tire tyre brake set setpoint",
+    ),
+)
+
+ESTIMATE = Likeness(
+    Dimension.FORCE,
+    _weights(
+        plus_3="estimate estimated estim est geschaetzt schaetz rig model simulated sim virtual "
+        "calculated calc",
+        plus_1="spring damper force kraft cmd out",
+        minus_2="measured meas cell load ist setpoint soll max min limit right",
+    ),
+)
+
+LIKELY = 3.0
+"""Least score of a signal that is proposed: a clear word, or unit, range and cycle together."""
+
+
+def rank_signals(messages: Iterable[Message], likeness: Likeness) -> list[RankedSignal]:
+    """Signals with a unit of the likeness's dimension, the likeliest first."""
+    found = [
+        _score(message, signal, likeness)
+        for message in messages
+        if message.name != _NOT_SENT
+        for signal in message.signals.values()
+        if measures(signal, likeness.dimension)
+    ]
+    return sorted(found, key=lambda item: -item.score)
+
+
+def words_without_unit(messages: Iterable[Message], likeness: Likeness) -> list[str]:
+    """Signals whose names fit and which the DBC gives no unit, the best first."""
+    found = [
+        (sum(weights.values()), f"{message.name}.{signal.name}")
+        for message in messages
+        for signal in message.signals.values()
+        if not signal.unit and signal.length_bits > 1
+        if (weights := _words(likeness.words, signal.name)) and sum(weights.values()) >= _CLEAR_WORD
+    ]
+    return [name for _, name in sorted(found, key=lambda item: -item[0])]
+
+
+def measures(signal: Signal, dimension: Dimension) -> bool:
+    """Whether a signal's unit is one of a dimension."""
+    try:
+        si_conversion(signal.unit, dimension)
+    except DatabaseError:
+        return False
+    return True
+
+
+def _score(message: Message, signal: Signal, likeness: Likeness) -> RankedSignal:
+    own = _words(likeness.words, signal.name)
+    around = _words(likeness.words, f"{signal.comment} {message.name}")
+    around = {word: weight for word, weight in around.items() if word not in own}
+    score = sum(own.values()) + _ELSEWHERE * sum(around.values())
+    reasons = [
+        f"{words} in its {where}"
+        for weights, where in ((own, "name"), (around, "comment or message"))
+        if (words := ", ".join(f"'{word}'" for word, weight in weights.items() if weight > 0))
+    ]
+    for found, why in (
+        _unit_score(signal, likeness),
+        _range_score(message, signal, likeness),
+        _step_score(message, signal, likeness),
+        _cycle_score(message),
+    ):
+        score += found
+        reasons += [why] if why else []
+    return RankedSignal(message, signal, score, tuple(reasons))
+
+
+_Scored = tuple[float, str]
+
+
+def _unit_score(signal: Signal, likeness: Likeness) -> _Scored:
+    if likeness.dimension is not Dimension.LENGTH:
+        return 0.0, f"in {signal.unit}"
+    metres = si_conversion(signal.unit, Dimension.LENGTH).factor
+    if metres > 100.0:
+        return -6.0, ""
+    return (1.0 if metres < 0.1 else 0.0), f"in {signal.unit}"
+
+
+def _range_score(message: Message, signal: Signal, likeness: Likeness) -> _Scored:
+    low, high = si_range(message, signal.name, likeness.dimension)
+    span = high - low
+    if likeness.spans is None or signal.minimum is None or not 0.0 < span < float("inf"):
+        return 0.0, ""
+    (least, most), (_, possible) = likeness.spans
+    if least <= span <= most:
+        return 1.0, f"range {signal.minimum:g} to {signal.maximum:g} {signal.unit}"
+    return (-3.0 if span > possible else 0.0), ""
+
+
+def _step_score(message: Message, signal: Signal, likeness: Likeness) -> _Scored:
+    if likeness.step is None:
+        return 0.0, ""
+    step = si_step(message, signal.name, likeness.dimension)
+    if step > 10.0 * likeness.step:
+        return -2.0, ""
+    if step > likeness.step:
+        return -1.0, ""
+    return 0.5, f"steps of {step * 1e3:.3g} mm" if step else ""
+
+
+def _cycle_score(message: Message) -> _Scored:
+    if message.cycle_time_ns is None:
+        return 0.0, ""
+    cycle_s = message.cycle_time_ns * 1e-9
+    why = f"every {cycle_s * 1e3:g} ms"
+    if cycle_s <= _FAST_S:
+        return 1.0, why
+    return (-1.0, why) if cycle_s >= _SLOW_S else (0.0, why)
+
+
+def _words(weights: Mapping[str, float], text: str) -> dict[str, float]:
+    """Words of a text, with their weights: parts of it, or beginnings of parts if short."""
+    plain = text.lower()
+    parts = split_name(text)
+    found = {
+        word: weight
+        for word, weight in weights.items()
+        if any(part.startswith(word) for part in parts)
+        or (len(word) >= _LETTERS_OF_A_PART and word in plain)
+    }
+    # `suspension` holds `susp`: one of them counts.
+    return {
+        word: weight
+        for word, weight in found.items()
+        if not any(word != other and word in other for other in found)
+    }
+
+
+def split_name(text: str) -> Sequence[str]:
+    """Words of a name in camel case or with underscores, in lower case."""
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
+    return [word.lower() for word in re.findall(r"[^\W\d_]+", spaced)]

@@ -1,0 +1,1 @@
+"""A bench of one's own: its proposal and its first model."""

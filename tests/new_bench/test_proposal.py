@@ -1,0 +1,220 @@
+"""Signals of foreign buses, and the configuration that is proposed from them."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from can_dbc.errors import InputError
+from rig.new_bench.proposal import Force, find_force, find_height, unclear_forces
+from rig.new_bench.signal_ranking import split_name
+from rig.plan.load import load_plan
+from rig.plan.preflight_checks import errors
+from tests.new_bench.proposing import find_signals, propose
+from tests.plan.test_own_dbc import DBC
+
+HEADER = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: SENSOR CONTROL\n\n'
+CYCLES = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_DEF_DEF_ "GenMsgCycleTime" 0;\n'
+
+
+@pytest.fixture
+def dbc(tmp_path: Path) -> Path:
+    path = tmp_path / "my.dbc"
+    path.write_text(DBC)
+    return path
+
+
+def write(dbc: Path, signals: dict[str, str], statements: str = "") -> Path:
+    """A DBC with a message for each signal, whose definition follows its name."""
+    messages = [
+        f"BO_ {number} M{number}: 8 SENSOR\n SG_ {name} : 0|16@1- {definition} CONTROL\n"
+        for number, (name, definition) in enumerate(signals.items(), start=1)
+    ]
+    dbc.write_text(HEADER + "\n".join(messages) + "\n" + CYCLES + statements)
+    return dbc
+
+
+def test_a_proposal_finds_height_temperature_and_where_to_publish(dbc):
+    text = propose(dbc)
+    assert yaml.safe_load(text) == {
+        "rate_hz": 1000,
+        "model": "reference",
+        "dbc": "my.dbc",
+        "bus": {"interface": "socketcan", "channel": "can0", "bitrate": 500000},
+        "signals": {
+            "height": {"message": "SENSOR_1", "signal": "Travel"},
+            "temperature": {"message": "SENSOR_1", "signal": "OilTemp"},
+        },
+        "publish": {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}},
+        "observers": {
+            "strut": {
+                "kind": "kalman",
+                # A tenth of a radian an interval of 1 ms, steps of 0.05 mm over the root of 12.
+                "filter": {"bandwidth_hz": 15.92, "noise_std_m": 1.443e-5},
+            }
+        },
+        "supervision": {
+            "stale_after_s": 0.01,
+            "safe_after_s": 0.5,
+            "limits": [
+                {"value": "measured_rate_m_per_s", "low": -10, "high": 10, "action": "refuse"},
+                {"value": "unchanged_s", "high": 1, "action": "hold"},
+            ],
+        },
+    }
+    assert "unsafe: {publish_without_valid: true}" in text
+    assert "'travel' in its name, in mm, steps of 0.05 mm, every 1 ms" in text
+
+
+def test_the_rate_is_that_of_the_height(dbc):
+    dbc.write_text(DBC.replace("BO_ 288 1;", "BO_ 288 2;"))
+    assert yaml.safe_load(propose(dbc))["rate_hz"] == 500
+
+
+MM = '(0.01,0) [0|300] "mm"'
+
+
+@pytest.mark.parametrize(
+    ("signals", "statements", "height"),
+    [
+        # A length that is measured elsewhere in a vehicle, faster and finer.
+        ({"Odometer": '(0.001,0) [0|65] "km"', "SuspFrnt_L_Actl": MM}, "", "M2.SuspFrnt_L_Actl"),
+        ({"ObjectDistance": MM, "WegHinten": '(0.1,0) [0|0] "mm"'}, "", "M2.WegHinten"),
+        ({"FuelLevel": MM, "Pos": '(0.1,0) [0|100] "mm"'}, "", "M2.Pos"),
+        # Only the comment says it.
+        ({"Ch1": MM, "Ch2": MM}, 'CM_ SG_ 2 Ch2 "stroke of the damper";', "M2.Ch2"),
+        # Names alike: the faster one.
+        ({"Stroke1": MM, "Stroke2": MM}, 'BA_ "GenMsgCycleTime" BO_ 2 5;', "M2.Stroke2"),
+        # `override` is no ride height, and a quantity may stand before the unit.
+        ({"Override": MM, "RideHgt": '(0.01,0) [0|300] "distance:mm"'}, "", "M2.RideHgt"),
+    ],
+)
+def test_the_height_is_what_names_range_and_cycle_say(signals, statements, height, dbc):
+    assert find_height(load_database(write(dbc, signals, statements)), None).name == height
+
+
+def test_a_dbc_without_a_height_is_answered_by_what_to_do(dbc):
+    with pytest.raises(InputError, match=r"\(there are M1\.Odometer\): name it with --height"):
+        find_height(load_database(write(dbc, {"Odometer": '(0.001,0) [0|65] "km"'})), None)
+    with pytest.raises(
+        InputError,
+        match=r"my\.dbc: no signal has a unit of length, .*M1\.ShockPot, give it its unit",
+    ):
+        find_height(load_database(write(dbc, {"ShockPot": '(1,0) [0|0] ""'})), None)
+    database = load_database(write(dbc, {"ShockPot": MM, "Force": '(1,0) [0|0] "N"'}))
+    assert find_height(database, "M1.ShockPot").why == "as named"
+    with pytest.raises(InputError, match=r"--height M2\.Force: has the unit 'N', .* of length"):
+        find_height(database, "M2.Force")
+    with pytest.raises(InputError, match=r"no signal 'ShockPit', did you mean ShockPot"):
+        find_height(database, "M1.ShockPit")
+    with pytest.raises(InputError, match=r"--height ShockPot: expected MESSAGE\.SIGNAL"):
+        find_height(database, "ShockPot")
+
+
+N = '(1,0) [0|0] "N"'
+
+
+def test_a_force_is_mapped_only_where_it_is_clear_where_it_acts(dbc):
+    comment = 'CM_ SG_ 2 F "Force of the cylinder on the carriage";'
+    database = load_database(write(dbc, {"Stroke": MM, "F": N}, comment))
+    assert find_force(database, Force.APPLIED, None).name == "M2.F"
+    assert find_force(database, Force.IN_STRUT, None) is None
+    database = load_database(write(dbc, {"Stroke": MM, "DamperLoadCell": N}))
+    assert find_force(database, Force.APPLIED, None) is None
+    assert find_force(database, Force.IN_STRUT, None).name == "M2.DamperLoadCell"
+    database = load_database(write(dbc, {"Stroke": MM, "Force": N, "BrakeForce": N}))
+    assert find_force(database, Force.APPLIED, None) is None
+    assert find_force(database, Force.IN_STRUT, None) is None
+    assert [item.name for item in unclear_forces(database, [])] == ["M2.Force"]
+    text = propose(dbc)
+    assert "# M2.Force: a force; applied_force (on the body) or load_cell_force?" in text
+    assert set(yaml.safe_load(text)["signals"]) == {"height"}
+
+
+def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
+    text = DBC.replace(
+        "BO_ 400",
+        "BO_ 300 SENSOR_2: 8 SENSOR\n"
+        ' SG_ EstForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
+    )
+    dbc.write_text(text)
+    published = yaml.safe_load(propose(dbc))["publish"]
+    assert published == {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}}
+
+
+def test_nothing_is_published_into_a_message_that_is_not_for_an_estimate(dbc):
+    dbc.write_text(DBC.replace("EstimatedForce", "BrakeForceDemand"))
+    proposed = yaml.safe_load(propose(dbc))
+    assert "publish" not in proposed
+
+
+def test_the_packages_own_dbc_gives_its_own_signals():
+    database = load_database(DEFAULT_DATABASE)
+    signals = find_signals(database)
+    assert {choice.quantity.key: choice.name for choice in signals.choices} == {
+        "height": "BENCH_MEASUREMENT.HEIGHT",
+        "applied_force": "BENCH_MEASUREMENT.APPLIED_FORCE",
+        "load_cell_force": "BENCH_AUXILIARY.LOAD_CELL_FORCE",
+        "temperature": "BENCH_AUXILIARY.TEMPERATURE",
+    }
+    assert signals.unclear == ()
+    proposed = yaml.safe_load(propose(DEFAULT_DATABASE))
+    assert proposed["publish"] == {
+        "force": {"message": "RIG_ESTIMATE", "signal": "SPRING_DAMPER_FORCE"},
+        "valid": {"message": "RIG_ESTIMATE", "signal": "VALID"},
+    }
+    assert proposed["status"] == "RIG_STATUS"
+
+
+def test_a_signal_that_says_valid_and_one_of_the_mode_are_proposed(dbc, tmp_path):
+    dbc.write_text(
+        DBC.replace(
+            " SG_ Setpoint",
+            ' SG_ ForceOk : 40|1@0+ (1,0) [0|1] "" SENSOR\n'
+            ' SG_ BridgeState : 55|4@0+ (1,0) [0|15] "" SENSOR\n SG_ Setpoint',
+        )
+    )
+    text = propose(dbc)
+    proposed = yaml.safe_load(text)
+    assert proposed["publish"]["valid"] == {"message": "CONTROL_1", "signal": "ForceOk"}
+    assert proposed["status"] == {"state": {"message": "CONTROL_1", "signal": "BridgeState"}}
+    (tmp_path / "my.yaml").write_text(text)
+    assert not errors(load_plan(tmp_path / "my.yaml"))
+
+
+FLAGS = (
+    ' SG_ {flag} : 32|1@0+ (1,0) [0|1] "" CONTROL\n SG_ Alive : 47|4@0+ (1,0) [0|15] "" CONTROL\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("flag", "values", "value"),
+    [
+        ("TravelOk", "", 1),
+        ("TravelFault", "", 0),
+        ("TravelQual", 'VAL_ 288 TravelQual 0 "ok" 1 "broken" ;\n', 0),
+    ],
+)
+def test_validity_and_counter_of_the_heights_message_are_used(flag, values, value, dbc, tmp_path):
+    signals = FLAGS.format(flag=flag) + " SG_ OilTemp"
+    dbc.write_text(DBC.replace(" SG_ OilTemp", signals) + values)
+    text = propose(dbc)
+    height = yaml.safe_load(text)["signals"]["height"]
+    assert height["valid"] == {"signal": flag, "value": value}
+    assert height["counter"] == "Alive"
+    (tmp_path / "my.yaml").write_text(text + "unsafe: {publish_without_valid: true}\n")
+    assert not errors(load_plan(tmp_path / "my.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("SuspFrnt_L_Actl", ["susp", "frnt", "l", "actl"]),
+        ("RRShockPot", ["rr", "shock", "pot"]),
+        ("load_cell_2", ["load", "cell"]),
+        ("Öldruck", ["öldruck"]),
+    ],
+)
+def test_words_of_a_name(name, words):
+    assert list(split_name(name)) == words
