@@ -6,40 +6,49 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.terminal import print_text
+from rig.cli.terminal import EXIT_CODES, print_text
 
-EXAMPLES = "Example: `rig docs reference`, then open reference/index.html"
+EXAMPLES = "Example: `rig docs guide`, then open guide/index.html"
 
 
 def docs(
     context: typer.Context,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder of the site.")],
 ) -> None:
-    """Write the reference: every effect, every key of a configuration, every command."""
-    from rig.guide.reference import write_reference
+    """Build the guide as a web site that works without a network."""
+    from rig.guide.reference import generated_blocks
+    from rig.guide.site import build_site
 
-    texts = dict(_texts(context.parent))
-    print_text(f"Written: {write_reference(folder, texts)}")
+    blocks = generated_blocks(lambda: "\n\n".join(_commands(context.parent)), EXIT_CODES)
+    print_text(f"Written: {build_site(folder, blocks)}")
 
 
-def _texts(parent: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Name and help of every command; the name of a command in a group begins with the group's."""
+def _commands(parent: Any, prefix: str = "rig") -> Iterator[str]:
+    """Markdown of every command: usage, help, arguments, options and examples."""
     for name in parent.command.list_commands(parent):
         command = parent.command.get_command(parent, name)
+        made = command.make_context(name, [], parent=parent, resilient_parsing=True)
         if hasattr(command, "list_commands"):
-            group = command.make_context(name, [], parent=parent, resilient_parsing=True)
-            yield from _texts(group, f"{prefix}{name} ")
+            yield from _commands(made, f"{prefix} {name}")
         else:
-            yield f"{prefix}{name}", _help(parent, name)
+            yield _command(f"{prefix} {name}", command, made)
 
 
-def _help(parent: Any, name: str) -> str:
-    """Usage, arguments and options of a command, as plain text."""
-    command = parent.command.get_command(parent, name)
-    made = command.make_context(name, [], parent=parent, resilient_parsing=True)
-    lines = [command.get_usage(made), "", (command.help or "").strip(), ""]
-    for parameter in command.get_params(made):
-        record = parameter.get_help_record(made)
-        name, text = record or (parameter.make_metavar(made), getattr(parameter, "help", "") or "")
-        lines.append(f"  {name:34} {text}")
-    return "\n".join(lines)
+def _command(name: str, command: Any, context: Any) -> str:
+    """A command's part of the page."""
+    rows: list[str] = []
+    arguments: list[str] = []
+    for parameter in command.get_params(context):
+        record = parameter.get_help_record(context)
+        shown, text = record or (parameter.make_metavar(context), parameter.help or "")
+        if record is None:
+            arguments.append(shown)
+        rows.append(f"| `{shown}` | {text.replace('|', chr(92) + '|')} |")
+    parts = [
+        f"## {name}",
+        f"    {' '.join((name, '[OPTIONS]', *arguments))}",
+        (command.help or "").strip(),
+        "\n".join(["| Argument or option | Meaning |", "| --- | --- |", *rows]),
+        (command.epilog or "").strip(),
+    ]
+    return "\n\n".join(part for part in parts if part)

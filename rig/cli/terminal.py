@@ -13,6 +13,16 @@ from can_dbc.errors import InputError
 from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
+EXIT_CODES = {
+    OK: "Done.",
+    FAILED: "A run ended in its safe state, without a height or with a log that lacks ticks; a "
+    "check, replay, comparison or tolerance failed; a run's files are damaged.",
+    WRONG_INPUT: "An input is wrong: one line on standard error names file, key, value and what "
+    "was expected.",
+    130: "Interrupted by Ctrl-C where there was nothing to end in order.",
+}
+"""Exit codes of all commands, with their meanings."""
+
 console = Console(markup=False)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]

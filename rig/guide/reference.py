@@ -1,13 +1,11 @@
-"""The reference, generated from the code: effects, keys of a configuration, commands."""
+"""Parts of the guide that the code knows, as Markdown: effects, keys, quantities, commands."""
 
-import base64
 import inspect
-import io
 import re
 import textwrap
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
@@ -24,8 +21,9 @@ from dart_model.spec import ModelSpec
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
 from rig.files.pictures import Figure
+from rig.formats.mapping import TableMapping
+from rig.guide.site import Block
 from rig.observers import OBSERVERS
-from rig.pages.html import render
 from rig.plan.config import OneOf, RunConfig
 from rig.simulated_bench.effects import EFFECT_KINDS
 from rig.simulated_bench.schema import BenchConfig
@@ -34,6 +32,9 @@ Array = NDArray[np.float64]
 
 _FIELDS = "__pydantic_fields__"
 """Attribute of a configuration's section, with its keys."""
+
+_THIN = 10
+"""Every how many steps of the integration a picture has a point."""
 
 _MOTION = Motion(
     low_m=0.35,
@@ -54,52 +55,133 @@ _MOTION = Motion(
 """Motion along which each effect is drawn, with the initial parameters of a search."""
 
 
-def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
-    """Write the reference as `index.html`, with the help text of each command; returns the file.
+_MOST_PARAMETERS = 12
+"""Rows of an effect's table: the table of forces has hundreds of parameters alike."""
 
-    Raises:
-        InputError: The folder cannot be written, or holds a reference.
+
+def generated_blocks(
+    commands: Callable[[], str], exit_codes: Mapping[int, str]
+) -> dict[str, Block]:
+    """Generated parts of the guide, by the names that stand in its pages.
+
+    Args:
+        commands: Markdown of every command.
+        exit_codes: Meanings of the commands' exit codes.
     """
-    path = folder / "index.html"
-    if path.exists():
-        raise InputError(f"{path}: exists, expected a folder without it")
-    try:
-        # Before the work of some seconds.
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-    text = render(
-        "reference/page.html",
-        families={
-            words: [item for item in CATALOGUE.values() if item.family == family]
-            for family, words in FAMILY_WORDS.items()
-        },
-        formula=_formula,
-        picture_of=_picture,
-        keys_of=_rows,
-        bridge=RunConfig,
-        observers=OBSERVERS,
-        measured=[
-            (q.key, q.dimension.value, q.column, q.words) for q in (HEIGHT, *BENCH_QUANTITIES)
-        ],
-        published=[
-            (group, item.key, item.dimension.value, item.signal)
-            for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
-            for item in items
-        ],
-        model=ModelSpec,
-        bench=BenchConfig,
-        bench_effects=[
-            (name, ", ".join(parameter.name for parameter in kind.parameters))
-            for name, kind in EFFECT_KINDS.items()
-        ],
-        commands=commands,
-    )
-    try:
-        path.write_text(text, "utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-    return path
+    texts: dict[str, Callable[[], str]] = {
+        "commands": commands,
+        "exit-codes": lambda: _table(
+            ("Exit code", "Meaning"), [(f"`{code}`", text) for code, text in exit_codes.items()]
+        ),
+        "configuration-keys": lambda: _keys(RunConfig),
+        "observer-keys": _observer_keys,
+        "model-keys": lambda: _keys(ModelSpec),
+        "mapping-keys": lambda: _keys(TableMapping),
+        "bench-keys": lambda: _keys(BenchConfig),
+        "bench-effects": _bench_effects,
+        "measured-quantities": _measured_quantities,
+        "published-quantities": _published_quantities,
+        "effect-families": _families,
+    }
+    blocks: dict[str, Block] = {name: _without_pictures(text) for name, text in texts.items()}
+    return {**blocks, "effects": _effects}
+
+
+def _without_pictures(text: Callable[[], str]) -> Block:
+    return lambda _: text()
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _keys(model: type[object]) -> str:
+    rows = [(f"`{key}`", default, meaning) for key, default, meaning in _rows(model)]
+    return _table(("Key", "Default", "Meaning"), rows)
+
+
+def _observer_keys() -> str:
+    parts = [f"### Kind `{kind}`\n\n{_keys(observer)}" for kind, observer in OBSERVERS.items()]
+    return "\n\n".join(parts)
+
+
+def _bench_effects() -> str:
+    rows = [
+        (f"`{name}`", ", ".join(f"`{parameter.name}`" for parameter in kind.parameters))
+        for name, kind in EFFECT_KINDS.items()
+    ]
+    return _table(("Effect", "Parameters"), rows)
+
+
+def _measured_quantities() -> str:
+    rows = [
+        (f"`{item.key}`", item.dimension.value, f"`{item.column}`", item.words)
+        for item in (HEIGHT, *BENCH_QUANTITIES)
+    ]
+    return _table(("Key under `signals`", "Unit", "Column of the log", "Meaning"), rows)
+
+
+def _published_quantities() -> str:
+    rows = [
+        (f"`{group}`", f"`{item.key}`", item.dimension.value, f"`{item.signal}`")
+        for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
+        for item in items
+    ]
+    return _table(("Under", "Key", "Unit", "Signal where only a message is given"), rows)
+
+
+def _families() -> str:
+    rows = [
+        (f"`{family}`", words, ", ".join(f"`{it.name}`" for it in _of_family(family)) or "-")
+        for family, words in FAMILY_WORDS.items()
+    ]
+    return _table(("Family", "Meaning", "Effects"), rows)
+
+
+def _of_family(family: str) -> list[Effect]:
+    return [item for item in CATALOGUE.values() if item.family == family]
+
+
+def _effects(pictures: Path) -> str:
+    """Every effect: parameters, formula, literature, and its force along a harmonic motion."""
+    parts: list[str] = []
+    for family, words in FAMILY_WORDS.items():
+        effects = _of_family(family)
+        if effects:
+            parts.append(f"## {words[0].upper()}{words[1:]} (`{family}`)")
+            parts += [_effect(item, pictures) for item in effects]
+    return "\n\n".join(parts)
+
+
+def _effect(item: Effect, pictures: Path) -> str:
+    rows = [
+        (f"`{it.name}`", it.unit or "-", f"{it.low:g} to {it.high:g}", it.meaning)
+        for it in item.parameters[:_MOST_PARAMETERS]
+    ]
+    more = len(item.parameters) - _MOST_PARAMETERS
+    simpler = f" Degenerates to {', '.join(item.simpler)}." if item.simpler else ""
+    parts = [
+        f"### {item.name}",
+        f"{item.words}.{simpler} Excitation that shows it: {item.excitation}.",
+        _table(("Parameter", "Unit", "Bounds", "Meaning"), rows),
+        *([f"And {more} more."] if more > 0 else []),
+        f"Force, N:\n\n```python\n{_formula('force_n', item.force)}\n```",
+    ]
+    if item.rate:
+        parts.append(
+            "Rate of its internal states:\n\n```python\n" + _formula("rate", item.rate) + "\n```"
+        )
+    if _draw(item, pictures / f"{item.name}.svg"):
+        parts.append(
+            f"![Force of {item.name} over height and over velocity](../generated/{item.name}.svg)"
+        )
+    parts.append(f"Reference: {item.reference}")
+    return "\n\n".join(parts)
 
 
 def _formula(name: str, law: Force | Rate) -> str:
@@ -111,23 +193,22 @@ def _formula(name: str, law: Force | Rate) -> str:
     return f"{head}\n{body}"
 
 
-def _picture(item: Effect) -> str:
-    """Force of an effect along a harmonic motion, a PNG in base64; empty if it has no start."""
+def _draw(item: Effect, path: Path) -> bool:
+    """Draw an effect's force along a harmonic motion; False if a search has no start for it."""
     starts = item.starts(_MOTION)
     if not starts:
-        return ""
+        return False
     height, velocity, force = _loop(item, list(starts[0]))
     figure: Any = Figure(figsize=(8, 2.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(height * 1e3, force, color="tab:blue")
+    left.plot(height[::_THIN] * 1e3, force[::_THIN], color="tab:blue")
     left.set(xlabel="height / mm", ylabel="force / N")
-    right.plot(velocity, force, color="tab:blue")
+    right.plot(velocity[::_THIN], force[::_THIN], color="tab:blue")
     right.set(xlabel="velocity / (m/s)")
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=80)
-    return base64.b64encode(file.getvalue()).decode("ascii")
+    figure.savefig(path, format="svg")
+    return True
 
 
 def _loop(item: Effect, parameters: list[float]) -> tuple[Array, Array, Array]:

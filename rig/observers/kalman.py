@@ -86,7 +86,7 @@ class KalmanObserver:
     """The noise-aware observer of one strut.
 
     Attributes:
-        kind: Tag of this observer in a configuration.
+        kind: Selects this observer: `kalman`.
         filter: The filter; `rig tune` chooses its bandwidth.
         force_limit_n: Largest magnitude of the virtual force.
     """

@@ -33,7 +33,7 @@ class NoObserver:
     """A strut without an observer.
 
     Attributes:
-        kind: Tag of this observer in a configuration.
+        kind: Selects this observer: `none`.
     """
 
     requires_height: ClassVar[bool] = False

@@ -88,7 +88,7 @@ class PiObserver:
     """Gains of one strut's observer; the defaults are those of the reference case.
 
     Attributes:
-        kind: Tag of this observer in a configuration.
+        kind: Selects this observer: `pi`, the default.
         proportional_n_per_m: K_P.
         integral_n_per_m_s: K_I.
         derivative_n_s_per_m: Gain of the innovation's rate; requires `filter`.

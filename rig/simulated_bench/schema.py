@@ -141,7 +141,7 @@ class _Multisine(_Section):
     """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
 
     Attributes:
-        kind: Tag of this component.
+        kind: Selects this kind of component.
         low_hz: Lowest frequency in Hz.
         high_hz: Highest frequency in Hz.
         lines: Number of frequencies.
@@ -199,7 +199,7 @@ class _File(_Section):
     """A column of a CSV file over its column `t_s`.
 
     Attributes:
-        kind: Tag of this component.
+        kind: Selects this kind of component.
         path: File, relative to the configuration, within its folder.
     """
 

@@ -1,0 +1,167 @@
+"""The guide as a web site: Markdown pages, what the code knows put into them, built by MkDocs.
+
+A page holds `<!-- generated: NAME -->` where a list or table stands that code knows; it is written
+there when the site is built, so that no page can contradict the program. Everything the site needs
+is in its folder: pages and search work from a file, without a network.
+"""
+
+import logging
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from can_dbc.errors import InputError
+from rig.machine.installed_versions import version_of
+
+PAGES = Path(__file__).with_name("pages")
+"""Folder of the pages."""
+
+GENERATED = re.compile(r"^<!-- generated: ([\w-]+) -->$", re.MULTILINE)
+"""Where a page has what code knows."""
+
+Block = Callable[[Path], str]
+"""Markdown of a generated part; pictures are written into the folder that it is given."""
+
+_PICTURES = "generated"
+"""Folder of generated pictures, below that of the pages."""
+
+_NAVIGATION: tuple[tuple[str, str], ...] = (
+    ("Tutorials", "tutorials"),
+    ("How to", "how-to"),
+    ("Reference", "reference"),
+    ("Explanation", "explanation"),
+    ("Evidence", "evidence"),
+)
+"""Kinds of pages, and their folders."""
+
+_EXTENSIONS: tuple[str, ...] = (
+    "admonition",
+    "attr_list",
+    "md_in_html",
+    "tables",
+    "toc",
+    "pymdownx.highlight",
+    "pymdownx.superfences",
+)
+
+
+def build_site(folder: Path, blocks: Mapping[str, Block]) -> Path:
+    """Build the site into a folder that is new or empty; returns its first page.
+
+    Args:
+        folder: Where it is built.
+        blocks: Generated parts, by the names that stand in the pages.
+
+    Raises:
+        InputError: The folder is not empty or cannot be written, MkDocs is not installed, or a
+            page names a generated part that there is not.
+    """
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: is not empty, expected a new folder")
+    build, load = _mkdocs()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+    with tempfile.TemporaryDirectory() as name:
+        source = Path(name) / "pages"
+        shutil.copytree(PAGES, source)
+        _fill(source, blocks)
+        config = Path(name) / "mkdocs.yml"
+        config.write_text("site_name: rig\n", "utf-8")
+        settings = _settings(source, folder.resolve())
+        logging.getLogger("mkdocs").setLevel(logging.WARNING)
+        build(load(str(config), **settings))
+    return folder / "index.html"
+
+
+def _mkdocs() -> tuple[Callable[[Any], None], Callable[..., Any]]:
+    try:
+        import material  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport, reportMissingImports]
+        from mkdocs.commands.build import build  # noqa: PLC0415
+        from mkdocs.config import load_config  # noqa: PLC0415
+    except ImportError:
+        raise InputError(
+            f"rig docs requires MkDocs Material: `pip install -e '.[guide]'`, or read {PAGES} as "
+            "it is, in Markdown"
+        ) from None
+    return build, load_config
+
+
+def _fill(source: Path, blocks: Mapping[str, Block]) -> None:
+    """Put the generated parts into the pages."""
+    pictures = source / _PICTURES
+    pictures.mkdir()
+    for page in sorted(source.rglob("*.md")):
+        text = page.read_text("utf-8")
+
+        def filled(match: re.Match[str], page: Path = page) -> str:
+            if match[1] not in blocks:
+                raise InputError(f"{page.name}: no generated part {match[1]!r}")
+            return blocks[match[1]](pictures)
+
+        changed = GENERATED.sub(filled, text)
+        if changed != text:
+            page.write_text(changed, "utf-8")
+
+
+def titles(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Title and path of each page of a folder, in the order of its `.order` file."""
+    for name in (folder / ".order").read_text("utf-8").split():
+        page = folder / f"{name}.md"
+        yield page.read_text("utf-8").partition("\n")[0].removeprefix("# "), page
+
+
+def _settings(source: Path, site: Path) -> dict[str, Any]:
+    navigation: list[dict[str, Any]] = [{"rig": "index.md"}]
+    for head, folder in _NAVIGATION:
+        pages = [
+            {title: page.relative_to(source).as_posix()} for title, page in titles(source / folder)
+        ]
+        navigation.append({head: pages})
+    palette = [
+        {
+            "media": f"(prefers-color-scheme: {name})",
+            "scheme": scheme,
+            "primary": "indigo",
+            "toggle": {"icon": icon, "name": f"Switch to {other} mode"},
+        }
+        for name, scheme, other, icon in (
+            ("light", "default", "dark", "material/weather-night"),
+            ("dark", "slate", "light", "material/weather-sunny"),
+        )
+    ]
+    return {
+        "site_name": f"rig {version_of('shock-rig')}",
+        "docs_dir": str(source),
+        "site_dir": str(site),
+        "use_directory_urls": False,
+        "strict": True,
+        "nav": navigation,
+        "theme": {
+            "name": "material",
+            "font": False,
+            "palette": palette,
+            "features": ["navigation.tabs", "navigation.footer", "toc.follow", "content.code.copy"],
+        },
+        "plugins": [{"search": {"lang": "en"}}, "offline"],
+        "markdown_extensions": [*_EXTENSIONS, {"toc": {"permalink": True}}],
+        "mdx_configs": {
+            "pymdownx.superfences": {
+                "custom_fences": [{"name": "math", "class": "math", "format": _format_math}]
+            }
+        },
+        "extra": {"generator": False},
+        "extra_css": ["style.css"],
+        "copyright": "MIT licence",
+    }
+
+
+def _format_math(source: str, *_: object, **__: object) -> str:
+    """An equation as MathML, which browsers draw by themselves."""
+    from latex2mathml.converter import convert  # noqa: PLC0415
+
+    return f'<div class="equation">{convert(source, display="block")}</div>'
