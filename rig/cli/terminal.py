@@ -1,5 +1,6 @@
 """The terminal: console, tables and JSON of the commands, their common options and exit codes."""
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +37,10 @@ Bitrate = Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")]
 
 def escape_controls(text: str) -> str:
     """Write out what would control the terminal in a text from outside."""
-    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+    return "".join(
+        c if c.isprintable() or c == "\n" or unicodedata.category(c) == "Zs" else repr(c)[1:-1]
+        for c in text
+    )
 
 
 def styled(text: str, style: str = "") -> Text:

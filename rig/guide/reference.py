@@ -19,6 +19,7 @@ from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
 from dart_model.spec import ModelSpec
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
+from rig.bridge.values import Mode
 from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
 from rig.files.pictures import Figure
 from rig.formats.mapping import TableMapping
@@ -82,6 +83,9 @@ def generated_blocks(
         "measured-quantities": _measured_quantities,
         "published-quantities": _published_quantities,
         "effect-families": _families,
+        "modes": lambda: _table(
+            ("Mode", "Number on the bus"), [(mode.name, str(mode.value)) for mode in Mode]
+        ),
     }
     blocks: dict[str, Block] = {name: _without_pictures(text) for name, text in texts.items()}
     return {**blocks, "effects": _effects}

@@ -9,7 +9,7 @@ import logging
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +28,68 @@ Block = Callable[[Path], str]
 _PICTURES = "generated"
 """Folder of generated pictures, below that of the pages."""
 
-_NAVIGATION: tuple[tuple[str, str], ...] = (
-    ("Tutorials", "tutorials"),
-    ("How to", "how-to"),
-    ("Reference", "reference"),
-    ("Explanation", "explanation"),
-    ("Evidence", "evidence"),
-)
-"""Kinds of pages, and their folders."""
+_NAVIGATION: dict[str, tuple[str, ...]] = {
+    "Tutorials": (
+        "tutorials/first-run",
+        "tutorials/own-bench",
+        "tutorials/dyno-file",
+        "tutorials/read-a-diagnosis",
+    ),
+    "How to": (
+        "how-to/adapter",
+        "how-to/canopen-j1939",
+        "how-to/several-struts",
+        "how-to/several-sensors",
+        "how-to/tune",
+        "how-to/supervise",
+        "how-to/watch",
+        "how-to/measured-data",
+        "how-to/damper",
+        "how-to/fleet",
+        "how-to/fmu",
+        "how-to/authenticate",
+        "how-to/real-time",
+        "how-to/python",
+        "how-to/extend",
+        "how-to/troubleshoot",
+    ),
+    "Reference": (
+        "reference/commands",
+        "reference/configuration",
+        "reference/quantities",
+        "reference/model-file",
+        "reference/effects",
+        "reference/mapping",
+        "reference/simulated-bench",
+        "reference/run-folder",
+        "reference/diagnosis-json",
+        "reference/faults",
+        "reference/signs",
+        "reference/glossary",
+    ),
+    "Explanation": (
+        "explanation/method",
+        "explanation/observers",
+        "explanation/validity",
+        "explanation/sample-times",
+        "explanation/timing",
+        "explanation/diagnosis",
+        "explanation/verdicts",
+        "explanation/damper-figures",
+        "explanation/architecture",
+    ),
+}
+"""Pages by their kind, in the order in which to read them."""
+
+_LISTED = {"Decisions": "explanation/decisions", "Evidence": "evidence"}
+"""Folders of which each page is listed, by its title."""
 
 _EXTENSIONS: tuple[str, ...] = (
     "admonition",
     "attr_list",
     "md_in_html",
     "tables",
-    "toc",
     "pymdownx.highlight",
-    "pymdownx.superfences",
 )
 
 
@@ -73,9 +118,23 @@ def build_site(folder: Path, blocks: Mapping[str, Block]) -> Path:
         config = Path(name) / "mkdocs.yml"
         config.write_text("site_name: rig\n", "utf-8")
         settings = _settings(source, folder.resolve())
-        logging.getLogger("mkdocs").setLevel(logging.WARNING)
-        build(load(str(config), **settings))
+        _build_strictly(lambda: build(load(str(config), **settings)))
     return folder / "index.html"
+
+
+def _build_strictly(build: Callable[[], None]) -> None:
+    """Build, and raise what MkDocs warns of, such as a link that leads nowhere."""
+    found: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("mkdocs")
+    logger.addHandler(handler)
+    try:
+        build()
+    except SystemExit:
+        raise InputError(f"the guide cannot be built: {'; '.join(found)}") from None
+    finally:
+        logger.removeHandler(handler)
 
 
 def _mkdocs() -> tuple[Callable[[Any], None], Callable[..., Any]]:
@@ -108,20 +167,24 @@ def _fill(source: Path, blocks: Mapping[str, Block]) -> None:
             page.write_text(changed, "utf-8")
 
 
-def titles(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Title and path of each page of a folder, in the order of its `.order` file."""
-    for name in (folder / ".order").read_text("utf-8").split():
-        page = folder / f"{name}.md"
-        yield page.read_text("utf-8").partition("\n")[0].removeprefix("# "), page
+def _entry(source: Path, page: Path) -> dict[str, str]:
+    """A page's entry in the navigation: its title, and its path."""
+    title = page.read_text("utf-8").partition("\n")[0].removeprefix("# ")
+    return {title: page.relative_to(source).as_posix()}
+
+
+def _navigation(source: Path) -> list[dict[str, Any]]:
+    listed = {head: sorted((source / folder).glob("*.md")) for head, folder in _LISTED.items()}
+    named = {head: [source / f"{name}.md" for name in names] for head, names in _NAVIGATION.items()}
+    heads = {
+        head: [_entry(source, page) for page in pages]
+        for head, pages in (named | listed).items()
+        if pages
+    }
+    return [{"Home": "index.md"}, *({head: pages} for head, pages in heads.items())]
 
 
 def _settings(source: Path, site: Path) -> dict[str, Any]:
-    navigation: list[dict[str, Any]] = [{"rig": "index.md"}]
-    for head, folder in _NAVIGATION:
-        pages = [
-            {title: page.relative_to(source).as_posix()} for title, page in titles(source / folder)
-        ]
-        navigation.append({head: pages})
     palette = [
         {
             "media": f"(prefers-color-scheme: {name})",
@@ -140,7 +203,8 @@ def _settings(source: Path, site: Path) -> dict[str, Any]:
         "site_dir": str(site),
         "use_directory_urls": False,
         "strict": True,
-        "nav": navigation,
+        "validation": dict.fromkeys(("anchors", "absolute_links", "unrecognized_links"), "warn"),
+        "nav": _navigation(source),
         "theme": {
             "name": "material",
             "font": False,
@@ -148,14 +212,19 @@ def _settings(source: Path, site: Path) -> dict[str, Any]:
             "features": ["navigation.tabs", "navigation.footer", "toc.follow", "content.code.copy"],
         },
         "plugins": [{"search": {"lang": "en"}}, "offline"],
-        "markdown_extensions": [*_EXTENSIONS, {"toc": {"permalink": True}}],
-        "mdx_configs": {
-            "pymdownx.superfences": {
-                "custom_fences": [{"name": "math", "class": "math", "format": _format_math}]
-            }
-        },
-        "extra": {"generator": False},
+        "markdown_extensions": [
+            *_EXTENSIONS,
+            {"toc": {"permalink": True}},
+            {
+                "pymdownx.superfences": {
+                    "custom_fences": [{"name": "math", "class": "math", "format": _format_math}]
+                }
+            },
+        ],
+        # The offline plugin adds one from the network where none is named.
+        "extra": {"generator": False, "polyfills": ["iframe-worker.js"]},
         "extra_css": ["style.css"],
+        "extra_javascript": ["labels.js"],
         "copyright": "MIT licence",
     }
 

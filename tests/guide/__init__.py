@@ -1,0 +1,1 @@
+"""The guide: its site, its sentences about commands and keys, its evidence."""
