@@ -120,7 +120,11 @@ InFolder = Annotated[str, Field(min_length=1, max_length=255), AfterValidator(_f
 
 
 class FileSkeleton(_Frozen):
-    """Bodies given by a URDF, SDF, SKEL or MJCF file in the model file's folder."""
+    """Bodies given by a URDF, SDF, SKEL or MJCF file in the model file's folder.
+
+    Attributes:
+        file: Its path, within that folder.
+    """
 
     file: InFolder
 
@@ -134,7 +138,12 @@ def _skeleton_kind(skeleton: object) -> str:
 
 
 class EffectSpec(_Frozen):
-    """An effect of the catalogue with its parameters."""
+    """An effect of the catalogue with its parameters.
+
+    Attributes:
+        name: Name of the effect in the catalogue.
+        parameters: Its parameters, by name; all of them.
+    """
 
     name: str
     parameters: dict[str, Finite] = Field(default_factory=dict[str, float])

@@ -43,8 +43,8 @@ def check_command(
         _print(config, findings)
         if not any(finding.severity is Severity.ERROR for finding in findings):
             print_text(
-                f"Next: `rig run {config} --listen-only --out first` for some seconds of the "
-                f"bench's usual motion, then `rig tune {config} --run first --out tuned.yaml`"
+                f"Next: `rig run {config} --listen-only --duration-s 20 --out first` while the "
+                f"bench moves as usual, then `rig tune {config} --run first --out tuned.yaml`"
             )
     write_summary(out, {"findings": as_dicts})
     outcomes = [

@@ -57,6 +57,7 @@ def diagnose(
         print_text(f"Printed: {out}/report.pdf")
     if result.diagnosis.effects or result.diagnosis.linear:
         print_text(
-            f"Next: `rig run CONFIG --model {out}/corrected.yaml`, whose observer is to be tuned "
-            "again: `rig tune` with that model and that run"
+            f"Next: `rig run CONFIG --model {out}/corrected.yaml --listen-only --duration-s 20 "
+            f"--out second`, then `rig tune CONFIG --model {out}/corrected.yaml --run second "
+            "--out corrected.yaml`: the old gains suit the old model"
         )

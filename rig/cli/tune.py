@@ -22,9 +22,13 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
-    "`rig tune rig.yaml --residual-n 80 --up-to-hz 5 --observer pi`"
+    "`rig tune rig.yaml --residual-n 80 --up-to-hz 5 --observer pi` · after a correction: "
+    "`rig tune rig.yaml --model found/corrected.yaml --run second --out corrected.yaml`"
 )
 
+
+_HARDLY = 0.8
+"""Share of the configured observer's expected error above which tuning hardly helps."""
 
 Run = Annotated[
     Path | None,
@@ -62,6 +66,12 @@ GainMargin = Annotated[
 def tune_command(
     config: ConfigFile,
     run: Run = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL", help="File or name of another model, such as a corrected one."
+        ),
+    ] = None,
     residual_n: ResidualRms = None,
     up_to_hz: HighestFrequency = None,
     noise_std_m: NoiseStd = None,
@@ -90,11 +100,11 @@ def tune_command(
         raise InputError(f"--observer {observer!r}: {expected_name(observer, KINDS)}")
     refuse_existing(out, plot)
     source = _source(run, residual_n, up_to_hz, noise_std_m)
-    plan, aim = load_plan(config), Aim(damping_ratio, gain_margin)
+    plan, aim = load_plan(config, model=model), Aim(damping_ratio, gain_margin)
     with progress_bar() as bar:
         struts = tune(plan, source, observer, aim, bar)
     if out is not None:
-        write_config(plan, struts, out)
+        write_config(plan, struts, out, model)
     if plot is not None:
         draw_tuning(struts, plot)
     if as_json:
@@ -141,6 +151,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
             "noise": chosen.expected.noise_n,
             "lag": chosen.expected.lag_n,
             "all": chosen.expected.force_n,
+            "configured": strut.configured.force_n,
             "paper": strut.published.force_n,
         },
         "damping_ratio": chosen.expected.damping_ratio,
@@ -194,19 +205,26 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
 def _print_errors(strut: "TunedStrut") -> None:
     from rig.tuning.gains import PAPER_HZ
 
-    expected, published, margin = strut.tuned.expected, strut.published, strut.tuned.gain_margin
-    rows: list[tuple[str, str, str]] = []
-    for label, name in (("by noise", "noise_n"), ("by lag", "lag_n"), ("RMS", "force_n")):
-        tuned, paper = (
-            f"{error:.3g} N" if error < 1e9 else "unstable"
-            for error in (getattr(expected, name), getattr(published, name))
-        )
-        rows.append((label, tuned, paper))
-    ratios = f"{expected.damping_ratio:.3f}", f"{published.damping_ratio:.3f}"
-    rows += [
-        ("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", f"{PAPER_HZ:.3g} Hz"),
-        ("least damping ratio", *ratios),
-        ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", ""),
+    errors = strut.tuned.expected, strut.configured, strut.published
+    rows = [
+        (label, *(_error_text(getattr(error, name)) for error in errors))
+        for label, name in (("by noise", "noise_n"), ("by lag", "lag_n"), ("RMS", "force_n"))
     ]
-    heads = ("expected error of the force", "tuned", "published gains, by mass")
+    margin = strut.tuned.gain_margin
+    rows += [
+        ("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", "", f"{PAPER_HZ:.3g} Hz"),
+        ("least damping ratio", *(f"{error.damping_ratio:.3f}" for error in errors)),
+        ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "", ""),
+    ]
+    heads = ("expected error of the force", "tuned", "configured", "published gains")
     print_table(heads, rows, f"Observer of “{strut.name}”")
+    tuned_n, configured_n = strut.tuned.expected.force_n, strut.configured.force_n
+    if tuned_n > _HARDLY * configured_n:
+        print_text(
+            f"Tuning hardly helps: {tuned_n:.3g} N expected instead of {configured_n:.3g} N. A "
+            "faster or less noisy height, or a model that lacks less, reduces the error further."
+        )
+
+
+def _error_text(error_n: float) -> str:
+    return f"{error_n:.3g} N" if error_n < 1e9 else "unstable"

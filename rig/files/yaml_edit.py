@@ -1,7 +1,7 @@
 """Changes of some keys in a YAML file that a person wrote: comments and order stay."""
 
 import io
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +26,15 @@ def set_keys(path: Path, place: Sequence[str], values: Mapping[str, object]) -> 
         KeyError: There is no such place.
         OSError: The file cannot be written.
     """
-    text = read_text(path)
+    write_durably(path, edit_keys(read_text(path), [(place, values)]))
+
+
+def edit_keys(text: str, changes: Iterable[tuple[Sequence[str], Mapping[str, object]]]) -> str:
+    """Text of a YAML file with keys of the mappings at some places set.
+
+    Raises:
+        KeyError: There is no such place.
+    """
     _, _, dashes = _guess_indent(text)
     offset = 2 if dashes else 0
     editor = _YAML()
@@ -34,10 +42,11 @@ def set_keys(path: Path, place: Sequence[str], values: Mapping[str, object]) -> 
     editor.width = _WIDEST
     editor.indent(mapping=2, sequence=offset + 2, offset=offset)
     content = editor.load(text)
-    entry = content
-    for key in place:
-        entry = entry[key]
-    cast("MutableMapping[str, object]", entry).update(values)
+    for place, values in changes:
+        entry = content
+        for key in place:
+            entry = entry[key]
+        cast("MutableMapping[str, object]", entry).update(values)
     changed = io.StringIO()
     editor.dump(content, changed)
-    write_durably(path, changed.getvalue())
+    return changed.getvalue()

@@ -151,7 +151,11 @@ class ForceChannel(_Channel):
 
 
 class TemperatureChannel(_Channel):
-    """A temperature; `offset_k` is added."""
+    """A temperature; `offset_k` is added.
+
+    Attributes:
+        offset_k: Added to what is read, in K.
+    """
 
     offset_k: Finite = 0.0
 

@@ -37,7 +37,12 @@ Points = Annotated[tuple[float, ...], Field(strict=False, min_length=2, max_leng
 
 
 class Mass(_Section):
-    """A body that moves along the vertical axis."""
+    """A body that moves along the vertical axis.
+
+    Attributes:
+        name: Name of the body.
+        mass_kg: Its mass in kg.
+    """
 
     name: Name
     mass_kg: Positive
@@ -104,7 +109,14 @@ class BenchStrut(_Section):
 
 
 class _Sine(_Section):
-    """A sine: amplitude * sin(angular frequency * t + phase_rad)."""
+    """A sine: amplitude * sin(angular frequency * t + phase_rad).
+
+    Attributes:
+        kind: Selects this kind of component.
+        frequency_hz: Frequency in Hz, or
+        angular_frequency_rad_per_s: angular frequency in rad/s.
+        phase_rad: Phase at time zero in rad.
+    """
 
     kind: Literal["sine"]
     frequency_hz: Positive | None = None
@@ -126,13 +138,21 @@ class _Sine(_Section):
 
 
 class Sine(_Sine):
-    """A sine force."""
+    """A sine force.
+
+    Attributes:
+        amplitude_n: Amplitude in N.
+    """
 
     amplitude_n: float
 
 
 class HeightSine(_Sine):
-    """A sine motion."""
+    """A sine motion.
+
+    Attributes:
+        amplitude_m: Amplitude in m.
+    """
 
     amplitude_m: float
 
@@ -162,19 +182,35 @@ class _Multisine(_Section):
 
 
 class Multisine(_Multisine):
-    """A multisine force; `rms_n` is the root mean square of the sum."""
+    """A multisine force; `rms_n` is the root mean square of the sum.
+
+    Attributes:
+        rms_n: Root mean square of the sum in N.
+    """
 
     rms_n: Positive
 
 
 class HeightMultisine(_Multisine):
-    """A multisine motion; `rms_m` is the root mean square of the sum."""
+    """A multisine motion; `rms_m` is the root mean square of the sum.
+
+    Attributes:
+        rms_m: Root mean square of the sum in m.
+    """
 
     rms_m: Positive
 
 
 class _Sweep(_Section):
-    """A sine whose frequency runs from one value to another within `duration_s`."""
+    """A sine whose frequency runs from one value to another within `duration_s`.
+
+    Attributes:
+        kind: Selects this kind of component.
+        start_hz: Frequency at the start in Hz.
+        end_hz: Frequency at the end in Hz.
+        duration_s: Time from start to end in s.
+        spacing: How the frequency changes: linear or logarithmic.
+    """
 
     kind: Literal["sweep"]
     start_hz: Positive
@@ -184,13 +220,21 @@ class _Sweep(_Section):
 
 
 class Sweep(_Sweep):
-    """A swept force; zero after `duration_s`."""
+    """A swept force; zero after `duration_s`.
+
+    Attributes:
+        amplitude_n: Amplitude in N.
+    """
 
     amplitude_n: float
 
 
 class HeightSweep(_Sweep):
-    """A swept motion; it stays where it ends."""
+    """A swept motion; it stays where it ends.
+
+    Attributes:
+        amplitude_m: Amplitude in m.
+    """
 
     amplitude_m: float
 
@@ -312,7 +356,11 @@ class UndeclaredEffect(_Section):
 
 
 class _Sensor(_Section):
-    """A sensor; its last field is the standard deviation of its white noise."""
+    """A sensor; its last field is the standard deviation of its white noise.
+
+    Attributes:
+        signal: Signal of the message.
+    """
 
     signal: str
 
@@ -324,27 +372,45 @@ class _Sensor(_Section):
 
 
 class HeightSensor(_Sensor):
-    """A sensor of a strut's height; `noise_std_m` is the standard deviation of white noise."""
+    """A sensor of a strut's height; `noise_std_m` is the standard deviation of white noise.
+
+    Attributes:
+        strut: Strut whose height it measures.
+        noise_std_m: Standard deviation of white noise in m.
+    """
 
     strut: Name
     noise_std_m: NotNegative = 0.0
 
 
 class AppliedForceSensor(_Sensor):
-    """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise."""
+    """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise.
+
+    Attributes:
+        noise_std_n: Standard deviation of white noise in N.
+    """
 
     noise_std_n: NotNegative = 0.0
 
 
 class LoadCell(_Sensor):
-    """A sensor of a strut's force; `noise_std_n` is the standard deviation of white noise."""
+    """A sensor of a strut's force; `noise_std_n` is the standard deviation of white noise.
+
+    Attributes:
+        strut: Strut whose force it measures.
+        noise_std_n: Standard deviation of white noise in N.
+    """
 
     strut: Name
     noise_std_n: NotNegative = 0.0
 
 
 class Thermometer(_Sensor):
-    """A sensor of the damper's temperature; `noise_std_k` is that of white noise."""
+    """A sensor of the damper's temperature; `noise_std_k` is that of white noise.
+
+    Attributes:
+        noise_std_k: Standard deviation of white noise in K.
+    """
 
     noise_std_k: NotNegative = 0.0
 

@@ -5,8 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
-import yaml
-
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
@@ -17,6 +15,7 @@ from rig.channels.channel import Channel
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.progress import Progress, within
+from rig.files.yaml_edit import edit_keys
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import paper_observer
 from rig.observers.protocol import AnyObserver, AnyTunableObserver
@@ -59,6 +58,7 @@ class TunedStrut:
         expectation: What it was tuned for.
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
+        configured: Expected error of the observer as it is configured.
         published: Expected error of the published gains, scaled by the effective mass.
         sweep: Expected errors at other bandwidths, by their frequencies in Hz.
     """
@@ -68,6 +68,7 @@ class TunedStrut:
     latency: Latency | None
     delay_s: float
     tuned: Tuned
+    configured: ExpectedError
     published: ExpectedError
     bandwidth_hz: float
     sweep: list[tuple[float, ExpectedError]]
@@ -132,6 +133,7 @@ def tune(
                 latency,
                 delay_s,
                 chosen,
+                expect_error(problem, strut.observer),
                 expect_error(problem, published),
                 chosen.observer.bandwidth_hz(problem.mobility_per_kg),
                 sweep_bandwidth(problem, chosen.observer, _FACTORS),
@@ -179,10 +181,16 @@ def _find_delay(
     return latency, delay_s
 
 
-def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
-    """Write the configuration with the tuned observers; comments are lost.
+def write_config(plan: Plan, tuned: list[TunedStrut], path: Path, model: str | None = None) -> None:
+    """Write the configuration with the tuned observers, and another model; comments stay.
 
     The file is a new one in the folder of the configuration, whose other files it names.
+
+    Args:
+        plan: Of the configuration.
+        tuned: Struts with their observers.
+        path: The new file.
+        model: File or name of the model with which they were tuned; the configuration's if None.
 
     Raises:
         InputError: The file exists, lies elsewhere or cannot be written.
@@ -191,24 +199,35 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
         raise InputError(
             f"--out {path}: expected a file in the folder of {plan.source}, whose files it names"
         )
-    content = parse_mapping(read_text(plan.source), str(plan.source))
-    content["observers"] = {strut.name: settings_of(strut.tuned.observer) for strut in tuned}
+    top: dict[str, object] = {
+        "observers": {strut.name: settings_of(strut.tuned.observer) for strut in tuned}
+    }
+    if model is not None:
+        is_file = Path(model).exists()
+        top["model"] = os.path.relpath(model, plan.source.absolute().parent) if is_file else model
+    text = read_text(plan.source)
+    changes: list[tuple[list[str], dict[str, object]]] = [([], top)]
     late = {strut.name: strut.delay_s for strut in tuned if strut.latency and strut.delay_s}
     if late:
-        signals = cast("dict[str, object]", content["signals"])
-        signals["height"] = {
-            name: entry.model_dump(exclude_defaults=True)
-            | ({"delay_s": late[name]} if name in late else {})
-            for name, entry in plan.config.signals.height.items()
-        }
         supervision = with_delay(plan, max(late.values())).config.supervision
-        content["supervision"] = cast("dict[str, object]", content.get("supervision") or {}) | {
+        content = parse_mapping(text, str(plan.source))
+        ages = {
             "stale_after_s": round(supervision.stale_after_s, 9),
             "safe_after_s": round(supervision.safe_after_s, 9),
         }
+        if content.get("supervision"):
+            changes.append((["supervision"], ages))
+        else:
+            top["supervision"] = ages
+        heights = cast("dict[str, dict[str, object]]", content["signals"])["height"]
+        # A model of one strut leaves its name out.
+        changes += [
+            (["signals", "height", *([name] if name in heights else [])], {"delay_s": delay_s})
+            for name, delay_s in late.items()
+        ]
     try:
         with path.open("x", encoding="utf-8") as file:
-            yaml.safe_dump(content, file, sort_keys=False)
+            file.write(edit_keys(text, changes))
     except OSError as error:
         raise InputError(f"--out {path}: {os.strerror(error.errno or 0)}") from error
 

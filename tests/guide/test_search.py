@@ -1,10 +1,7 @@
 """The site in a browser, opened from a file: its search, and whether everyone can use it."""
 
-import sys
-
 import pytest
 
-from rig.cli.main import main
 from tests.view.browser import browser, needs_chromium, until
 
 pytestmark = needs_chromium
@@ -18,16 +15,6 @@ PAGES = ("index", "tutorials/own-bench", "reference/effects", "reference/command
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("guide") / "site"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(sys, "argv", ["rig", "docs", str(folder)])
-        with pytest.raises(SystemExit):
-            main()
-    return folder
-
-
-@pytest.fixture(scope="module")
 def chromium():
     with browser() as made:
         yield made
@@ -36,7 +23,7 @@ def chromium():
 @pytest.mark.parametrize(
     ("word", "found"),
     [
-        ("bandwidth_hz", "reference/configuration.html"),
+        ("bandwidth_hz", "explanation/observers.html"),
         ("pinching", "reference/glossary.html"),
         ("E2E", "reference/"),
     ],

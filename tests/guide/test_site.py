@@ -8,25 +8,9 @@ import pytest
 
 from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
-from rig.cli.main import main
 from rig.guide import site as guide
 from rig.guide.site import PAGES, build_site
-
-
-def build(folder, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["rig", "docs", str(folder)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """The site, which is built strictly: a link or an anchor that leads nowhere is an error."""
-    folder = tmp_path_factory.mktemp("guide") / "site"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        assert build(folder, monkeypatch) == 0
-    return folder
+from tests.guide.conftest import build_by_command
 
 
 def text_of(site, page):
@@ -84,9 +68,9 @@ def test_the_search_knows_what_an_engineer_looks_for(site):
 def test_a_site_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    assert build(tmp_path / "full", monkeypatch) == 2
+    assert build_by_command(tmp_path / "full", monkeypatch) == 2
     assert "full: is not empty, expected a new folder" in capsys.readouterr().err
-    assert build(tmp_path / "full" / "mine.txt", monkeypatch) == 2
+    assert build_by_command(tmp_path / "full" / "mine.txt", monkeypatch) == 2
     assert "mine.txt" in capsys.readouterr().err
 
 

@@ -9,6 +9,7 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
+from dart_model.spec import MODELS
 from rig.cli.main import main
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan, plan_of_run
@@ -134,13 +135,35 @@ def test_the_command(late, monkeypatch, capsys, tmp_path):
     asked = ("tune", late / "rig.yaml", "--residual-n", 60, "--up-to-hz", 5)
     assert rig(monkeypatch, *asked, "--plot", tmp_path / "plot.png") == 0
     said = capsys.readouterr().out
-    assert "published gains, by mass" in said
+    assert "published gains" in said
+    assert "configured" in said
+    assert "Tuning hardly helps" not in said
     assert (tmp_path / "plot.png").stat().st_size > 10_000
     assert rig(monkeypatch, *asked, "--json") == 0
     [found] = json.loads(capsys.readouterr().out)
     assert found["observer"]["kind"] == "kalman"
     parts = found["expected_force_error_n"]
     assert parts["all"] == pytest.approx(np.hypot(parts["noise"], parts["lag"]))
+
+
+def test_a_second_tuning_hardly_helps_and_another_model_is_written(late, monkeypatch, capsys):
+    text = (late / "rig.yaml").read_text()
+    (late / "noted.yaml").write_text(f"# of this bench\n{text}")
+    asked = ("--residual-n", 60, "--up-to-hz", 5)
+    first = late / "first.yaml"
+    assert rig(monkeypatch, "tune", late / "noted.yaml", *asked, "--out", first) == 0
+    assert first.read_text().startswith("# of this bench\n")
+    capsys.readouterr()
+    second = late / "second.yaml"
+    corrected = late / "corrected.yaml"
+    corrected.write_text(
+        (MODELS / "reference.yaml").read_text().replace("mass_kg: 10.0", "mass_kg: 11.0")
+    )
+    assert rig(monkeypatch, "tune", first, *asked, "--model", corrected, "--out", second) == 0
+    assert "Tuning hardly helps" in capsys.readouterr().out
+    plan = load_plan(second)
+    assert plan.config.model == "corrected.yaml"
+    assert plan.model.skeleton.bodies[0].mass_kg == 11.0
 
 
 @pytest.mark.parametrize(
