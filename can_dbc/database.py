@@ -184,11 +184,12 @@ def _reason(path: Path, message: str, error: DatabaseError) -> str:
 
 def _read(path: Path) -> bytes:
     try:
-        is_file = path.is_file()
+        is_file, is_folder = path.is_file(), path.is_dir()
     except (OSError, ValueError):  # a name that no file can have
-        is_file = False
+        is_file = is_folder = False
     if not is_file:
-        raise DatabaseError(f"{ascii(str(path))[1:-1]}: no such file, expected a DBC file")
+        kind = "is a folder" if is_folder else "no such file"
+        raise DatabaseError(f"{ascii(str(path))[1:-1]}: {kind}, expected a DBC file")
     try:
         with path.open("rb") as file:
             content = file.read(SIZE_MAX_BYTES + 1)

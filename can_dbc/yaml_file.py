@@ -81,7 +81,8 @@ class _PlainLoader(yaml.SafeLoader):
             key = cast("object", cast("Any", self).construct_object(key_node, deep=True))
             if isinstance(key, Hashable) and key in seen:
                 raise yaml.MarkedYAMLError(
-                    problem=f"key {key!r} stands here twice", problem_mark=key_node.start_mark
+                    problem=f"key {key!r} occurs twice: delete one of them",
+                    problem_mark=key_node.start_mark,
                 )
             if isinstance(key, Hashable):
                 seen.add(key)
@@ -109,6 +110,10 @@ _CURES = {
     "<stream end>": "a bracket is open to the end of the file",
 }
 """Part of what PyYAML says -> what a person has to look for."""
+
+
+_KINDS = ((type(None), "is empty"), (list, "is a list"), (str, "is a single text"))
+"""What a file is that has no keys."""
 
 
 def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
@@ -150,8 +155,8 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{source}: is no valid YAML: {reason}") from error
     if not isinstance(data, dict):
-        kind = "nothing" if data is None else type(data).__name__
-        raise FileError(f"{source}: expected keys and values at the top level, not {kind}")
+        kind = next((text for type_, text in _KINDS if isinstance(data, type_)), "is a number")
+        raise FileError(f"{source}: {kind}, expected keys and values")
     mapping = cast("dict[object, object]", data)
     for key in mapping:
         if not isinstance(key, str):
@@ -183,39 +188,114 @@ def load_yaml(model: type[_Model], path: Path, context: object = None) -> _Model
 _NO_MAPPING = ("dict_type", "model_type", "model_attributes_type", "dataclass_type")
 """pydantic's names for a value where keys and values are expected."""
 
+_EXPECTED = {
+    "bool_type": "expected true or false",
+    "bool_parsing": "expected true or false",
+    "finite_number": "expected a finite number",
+    "float_type": "expected a number",
+    "int_from_float": "expected an integer",
+    "int_parsing": "expected an integer",
+    "int_type": "expected an integer",
+    "list_type": "expected a list",
+    "string_too_short": "expected a text that is not empty",
+    "string_type": "expected a text",
+    "tuple_type": "expected a list",
+}
+"""pydantic's name of an error -> what was expected."""
+
+_BOUNDS = {
+    "greater_than": ("gt", "expected more than {}"),
+    "greater_than_equal": ("ge", "expected {} or more"),
+    "less_than": ("lt", "expected less than {}"),
+    "less_than_equal": ("le", "expected {} or less"),
+    "string_too_long": ("max_length", "expected at most {} characters"),
+    "too_long": ("max_length", "expected at most {} items"),
+    "too_short": ("min_length", "expected at least {} item(s)"),
+}
+"""pydantic's name of an error -> name of the bound, and what was expected of the value."""
+
+_MOST_MORE = 3
+"""Further wrong keys that a line names."""
+
+_LONGEST_VALUE = 60
+
 
 def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
     errors = error.errors(include_url=False)
-    # A list whose items are wrong is also called too short: that says nothing more.
+    # A list whose items are wrong is also called too short: that adds nothing.
     deepest = max(len(item["loc"]) for item in errors)
     errors = [item for item in errors if item["type"] != "too_short" or len(item["loc"]) == deepest]
     first = max(errors, key=lambda item: (len(item["loc"]), item["type"] == "extra_forbidden"))
-    # Parts in angle brackets are not keys: they distinguish the kinds of value under one.
-    parts = [part for part in first["loc"] if part != "" and not str(part).startswith("<")]
+    parts = _key_parts(first["loc"])
     key = ".".join(str(part) for part in parts) or "top level"
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
+    more = _more([item["loc"] for item in errors if item is not first])
+    context = cast("dict[str, object]", first.get("ctx", {}))
+    cause = context.get("error")
     if cause is not None:
         where = f"{source}: {key}" if parts else source
         return f"{where}: {cause}{more}"
     kind = first["type"]
     if kind == "missing":
-        return f"{source}: {key}: is missing, expected a value{more}"
+        return f"{source}: {_missing(parts)}{more}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _keys(model.model_json_schema(), parts[:-1])
         expected = f", {expected_name(str(parts[-1]), known)}" if known else ""
         return f"{source}: {key}: unknown key{expected}{more}"
     if kind == "union_tag_invalid":
-        context = cast("dict[str, str]", first.get("ctx", {}))
-        tag, choices = (context[name].strip("'<>") for name in ("tag", "expected_tags"))
-        expected = choices.replace("'", "").replace("<", "").replace(">", "").split(", ")
-        return f"{source}: {key}: {tag!r}: {expected_name(tag, expected)}{more}"
+        tag = str(context["tag"]).strip("'<>")
+        key = ".".join((key, str(context["discriminator"]).strip("'()")))
+        expected = expected_name(tag, _choices(context["expected_tags"]))
+        return f"{source}: {key}: {tag!r}: {expected}{more}"
+    return f"{source}: {key}: {_shown(first['input'])}{_expected(first, context)}{more}"
+
+
+def _key_parts(location: Iterable[int | str]) -> list[int | str]:
+    """Keys and indices of a place; parts in angle brackets only distinguish kinds of a value."""
+    return [part for part in location if part != "" and not str(part).startswith("<")]
+
+
+def _more(others: Sequence[Iterable[int | str]]) -> str:
+    if not others:
+        return ""
+    keys = dict.fromkeys(".".join(map(str, _key_parts(item))) or "top level" for item in others)
+    named = ", ".join(list(keys)[:_MOST_MORE]) + (", ..." if len(keys) > _MOST_MORE else "")
+    return f" (and {len(others)} more: {named})"
+
+
+def _missing(parts: Sequence[int | str]) -> str:
+    if parts and isinstance(parts[-1], int):
+        list_key = ".".join(map(str, parts[:-1]))
+        return f"{list_key}: {parts[-1]} items, expected more"
+    return f"{'.'.join(map(str, parts))}: is missing, expected a value"
+
+
+def _choices(text: object) -> list[str]:
+    """Choices as pydantic lists them in one text."""
+    return re.findall(r"'<?([^'<>]+)>?'", str(text))
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "is empty, "
+    text = repr(value)
+    return (text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "...") + ": "
+
+
+def _expected(first: Any, context: dict[str, object]) -> str:
+    kind, value = first["type"], first["input"]
     if kind in _NO_MAPPING:
-        shown = repr(cast("object", first["input"]))[:60]
-        return f"{source}: {key}: {shown}: expected keys and values{more}"
-    value = repr(cast("object", first["input"]))
-    shown = value if len(value) <= 60 else value[:57] + "..."
-    return f"{source}: {key}: {shown}: {first['msg'][0].lower()}{first['msg'][1:]}{more}"
+        return "expected keys and values"
+    if kind == "float_parsing":
+        if re.fullmatch(r"-?\d+,\d+", str(value)):
+            return "expected a number with a decimal point"
+        return "expected a number alone: its unit is that of the key"
+    if kind in _BOUNDS:
+        name, text = _BOUNDS[kind]
+        bound = context[name]
+        return text.format(f"{bound:g}" if isinstance(bound, float) else bound)
+    if kind == "literal_error" and isinstance(value, str):
+        return expected_name(value, _choices(context["expected"]))
+    return _EXPECTED.get(kind, f"{first['msg'][0].lower()}{first['msg'][1:]}")
 
 
 _Schema = dict[str, Any]

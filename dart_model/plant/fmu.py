@@ -278,8 +278,10 @@ def read_description(content: bytes, path: Path) -> Any:
     try:
         description = cast("Any", fmpy).read_model_description(io.BytesIO(content))
     except Exception as error:  # of any library that a hostile archive may upset
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ModelError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
+        raise ModelError(
+            f"{path}: is no FMU of FMI 2.0 or 3.0, expected an archive with a valid "
+            "modelDescription.xml: export it again"
+        ) from error
     _refuse_outside(content, path, description)
     if any(item.variable.derivative is None for item in description.derivatives):
         raise ModelError(f"{path}: a derivative without a state, expected the state that it is of")

@@ -310,13 +310,23 @@ def open_bus(
     return bus
 
 
+_DRIVERS = {
+    "pcan": ": expected PEAK's driver, PCAN-Basic, to be installed",
+    "slcan": ": expected the package pyserial (`pip install pyserial`), and the adapter's device",
+    "vector": ": expected Vector's XL driver library to be installed",
+    "kvaser": ": expected Kvaser's CANlib to be installed",
+    "ixxat": ": expected the VCI driver of HMS to be installed",
+}
+"""What interfaces need that is not part of python-can."""
+
+
 def _cure(config: BusConfig, error: Exception) -> str:
     """What to do about a SocketCAN interface that cannot be opened; empty where that is not known.
 
     python-can raises what the kernel reports, an `OSError`.
     """
     if config.interface != "socketcan":
-        return ""
+        return _DRIVERS.get(config.interface, "")
     name = config.channel
     up = f"`ip link set {name} up type can bitrate {config.bitrate}` as root"
     cures = {

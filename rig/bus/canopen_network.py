@@ -101,7 +101,10 @@ class CanOpenNetwork:
         except self._aborted:
             return None
         except (self._failed, can.CanError, OSError, struct.error) as error:
-            raise BusError(f"node {node_id}, object {index:04X}h: no answer: {error}") from error
+            raise BusError(
+                f"node {node_id}, object {index:04X}h: no answer ({error}): is the device "
+                "powered, and the bit rate the bus's own? `rig sensor scan` lists the nodes"
+            ) from error
 
     def write(self, node_id: int, index: int, subindex: int, content: bytes) -> None:
         """Write an object.

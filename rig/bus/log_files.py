@@ -73,8 +73,12 @@ def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
                 first_ns = at_ns if first_ns is None else first_ns
                 yield at_ns, _frame(message, at_ns - first_ns)
     except errors as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise BusLogError(f"{path}: is not such a log, or is damaged: {reason}") from error
+        kind = path.suffix.lstrip(".").upper()
+        raise BusLogError(
+            f"{path}: is no valid {kind} log, or is damaged: export it again"
+        ) from error
+    if first_ns is None:
+        raise BusLogError(f"{path}: holds no frame, expected a log in the format of its ending")
 
 
 def _open(path: Path) -> IO[str] | IO[bytes]:

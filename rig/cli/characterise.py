@@ -42,6 +42,7 @@ Master = Annotated[
 Scatter = Annotated[
     float,
     typer.Option(
+        metavar="SHARE",
         min=0.001,
         max=0.5,
         help="Relative standard deviation of each property among good dampers.",
@@ -52,7 +53,7 @@ Scatter = Annotated[
 def characterise_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files of measured data."),
+        typer.Argument(metavar="RUN", help="Folders of runs, or CSV files of measured data."),
     ],
     strut: StrutOfRun = None,
     out: Annotated[
@@ -68,7 +69,7 @@ def characterise_command(
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
-    """Find the figures of a damper: force over velocity, energy, gas, friction, knee, temperature.
+    """Report the figures of a damper: force over velocity, energy, gas force, friction, knee.
 
     The cycles of a record must repeat; the page lays several records over one another. With a
     tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master

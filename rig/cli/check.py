@@ -31,7 +31,7 @@ def check_command(
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
-    """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
+    """Report what is wrong before a bench moves: signals, units, rate, bus load, poles."""
     from rig.plan.load import load_plan
     from rig.plan.preflight_checks import Severity, check
 

@@ -22,9 +22,7 @@ EXAMPLES = (
 def compare_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="A B...", help="Folders of runs, or CSV files: states of one damper."
-        ),
+        typer.Argument(metavar="RUN", help="Folders of runs, or CSV files: states of one damper."),
     ],
     dose: Annotated[
         list[float] | None,

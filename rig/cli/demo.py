@@ -23,11 +23,15 @@ def demo(
     case: Annotated[
         str,
         typer.Option(
-            help=f"{STORY}: the whole story; or a plain case: reference, quarter_car, dyno."
+            metavar="CASE",
+            help=f"{STORY}: the whole story; or a plain case: reference, quarter_car, dyno.",
         ),
     ] = STORY,
     seed: Annotated[
-        int, typer.Option(min=0, help="Selects the undeclared effect of the story's bench.")
+        int,
+        typer.Option(
+            metavar="N", min=0, help="Selects the undeclared effect of the story's bench."
+        ),
     ] = 1,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write into; rig-demo by default.")
@@ -35,7 +39,9 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
     ] = False,
-    duration_s: Annotated[float | None, typer.Option(min=1.0, help="Length of a run in s.")] = None,
+    duration_s: Annotated[
+        float | None, typer.Option(metavar="S", min=1.0, help="Length of a run.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
@@ -69,11 +75,18 @@ def _run_story(
     from rig.demo.story import run_story
 
     with stoppable() as stop, status_line(duration_s) as watch, progress_bar() as bar:
+
+        def chapter(text: str) -> None:
+            if stop():
+                raise typer.Abort
+            if not as_json:
+                console.print(f"- {text}")
+
         story = run_story(
             seed,
             out,
             DemoOptions(lockstep, duration_s, stop, watch),
-            chapter=lambda text: None if as_json else console.print(f"- {text}"),
+            chapter=chapter,
             diagnosis_progress=bar,
         )
     if as_json:

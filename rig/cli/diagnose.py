@@ -15,7 +15,7 @@ EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 -
 
 def diagnose(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files.")
+        list[Path], typer.Argument(metavar="RUN", help="Folders of runs, or CSV files.")
     ],
     model: Annotated[
         str,

@@ -41,7 +41,7 @@ def _command(name: str, command: Any, context: Any) -> str:
     for parameter in command.get_params(context):
         record = parameter.get_help_record(context)
         shown, text = record or (parameter.make_metavar(context), parameter.help or "")
-        if record is None:
+        if parameter.param_type_name == "argument":
             arguments.append(shown)
         rows.append(f"| `{shown}` | {text.replace('|', chr(92) + '|')} |")
     parts = [

@@ -24,7 +24,8 @@ def export_command(
     ],
     out: Annotated[Path, typer.Option(metavar="PATH", help="New file; for Parquet a folder.")],
     kind: Annotated[
-        str | None, typer.Option("--format", help="Of a run: mf4, parquet, csv or candump.")
+        str | None,
+        typer.Option("--format", metavar="FORMAT", help="Of a run: mf4, parquet, csv or candump."),
     ] = None,
     smoothed: Annotated[
         bool,
@@ -35,16 +36,17 @@ def export_command(
     fmu: Annotated[
         bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
     ] = False,
-    fmi: Annotated[str, typer.Option(help="With --fmu: 2.0 or 3.0.")] = "2.0",
+    fmi: Annotated[str, typer.Option(metavar="VERSION", help="With --fmu: 2.0 or 3.0.")] = "2.0",
     strut: Annotated[
-        str | None, typer.Option(help="With --fmu: which strut, if there are several.")
+        str | None,
+        typer.Option(metavar="NAME", help="With --fmu: which strut, if there are several."),
     ] = None,
     bench: Annotated[
         bool,
         typer.Option("--bench", help="With --fmu: the whole bench, if one guided degree moves."),
     ] = False,
 ) -> None:
-    """Write a run or a model for other programs.
+    """Export a run or a model to other programs.
 
     A run becomes MF4, Parquet, CSV or candump; a model, with --fmu, a functional mock-up unit for
     Model Exchange and Co-Simulation, with its C sources and with binaries for Linux, Windows and

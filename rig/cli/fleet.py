@@ -4,15 +4,16 @@ import contextlib
 import csv
 import sys
 import time
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from typer.core import TyperGroup
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
+from rig.cli.plain_help import PlainCommand, PlainGroup
 from rig.cli.terminal import (
     FAILED,
     OK,
@@ -32,11 +33,13 @@ if TYPE_CHECKING:
 RUN = "run"
 
 
-class _OrRun(TyperGroup):
+class _OrRun(PlainGroup):
     """`rig fleet SOURCE...` is `rig fleet run SOURCE...`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] != "--help":
+            if get_close_matches(args[0], self.commands) and not Path(args[0]).exists():
+                raise InputError(f"rig fleet {args[0]}: {expected_name(args[0], self.commands)}")
             args = [RUN, *args]
         return super().parse_args(ctx, args)
 
@@ -72,12 +75,12 @@ PathPattern = Annotated[
 ]
 
 
-@app.command(RUN, epilog=RUN_EXAMPLES)
+@app.command(RUN, epilog=RUN_EXAMPLES, cls=PlainCommand)
 def run_command(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SOURCE...",
+            metavar="SOURCE",
             help="Run folders, CSV files, or folders of them; also as URLs that fsspec knows.",
         ),
     ],
@@ -87,7 +90,7 @@ def run_command(
     out: Annotated[Path, typer.Option(metavar="STORE", help="Store, new or to continue.")],
     path: PathPattern = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes; by default one a core.")
+        int | None, typer.Option(metavar="N", min=1, help="Processes; by default one a core.")
     ] = None,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that runs.")
@@ -132,6 +135,9 @@ def run_command(
         print_json(end._asdict())
     else:
         print_text(end.words)
+        if end.failed:
+            sql = "SELECT run, error FROM runs WHERE error IS NOT NULL"
+            print_text(f'Which, and why: `rig fleet query {out} "{sql}"`')
         print_text(f"Store: {out}")
     return FAILED if end.failed else OK
 
@@ -164,7 +170,7 @@ def _progress() -> "Generator[Callable[[CampaignProgress], None]]":
     yield line
 
 
-@app.command("query", epilog=QUERY_EXAMPLES)
+@app.command("query", epilog=QUERY_EXAMPLES, cls=PlainCommand)
 def query_command(
     store: Store,
     sql: Annotated[
@@ -173,13 +179,15 @@ def query_command(
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Ask a store, in SQL (DuckDB): one SELECT statement, which opens no other file.
+    """Query a store in SQL (DuckDB): one SELECT statement, which opens no other file.
 
     `runs` has a row a run, `effects` a row a parameter of the model (kind `model`) or of an effect
     that it lacks (`found`), `values` also the figures of `rig characterise` (`figure`).
     """
     from rig.fleet.store import query
 
+    if as_csv and as_json:
+        raise InputError("--csv and --json: expected one of them")
     names, rows = query(store, sql)
     if as_json:
         print_json([dict(zip(names, map(_plain, row), strict=True)) for row in rows])
@@ -196,7 +204,7 @@ def _plain(value: object) -> object:
     return value if isinstance(value, int | float | str | bool | None) else str(value)
 
 
-@app.command("report", epilog=REPORT_EXAMPLES)
+@app.command("report", epilog=REPORT_EXAMPLES, cls=PlainCommand)
 def report_command(
     store: Store,
     out: Annotated[

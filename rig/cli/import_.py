@@ -60,12 +60,12 @@ def import_command(
         float | None, typer.Option(metavar="KG", help="With --fmu: what a strut alone carries.")
     ] = None,
 ) -> None:
-    """Make a CSV of a foreign table, a run of a bus log or of an export, a model of an FMU.
+    """Import a foreign table as CSV, a bus log or an export as a run, an FMU as a model.
 
     A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, or --rebound if it is of MTS; a bus log
-    (BLF, ASC, candump, TRC, MF4) requires --config; what `rig export` wrote requires neither. With
-    --fmu, SOURCE is a functional mock-up unit: a program, which from then on may run on this
-    machine.
+    (BLF, ASC, candump, TRC, MF4) requires --config; what `rig export` wrote as MF4 or Parquet
+    requires neither, and its CSV is read as it is by what reads runs. With --fmu, SOURCE is a
+    functional mock-up unit: a program, which from then on may run on this machine.
     """
     if fmu:
         if config is not None or rebound is not None:

@@ -88,7 +88,9 @@ def init(
     ] = None,
     listen_s: Annotated[
         float | None,
-        typer.Option(min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."),
+        typer.Option(
+            metavar="S", min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."
+        ),
     ] = None,
     interface: Interface = "socketcan",
     channel: Channel = "can0",

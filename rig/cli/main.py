@@ -1,13 +1,16 @@
 """The command line: every command, and the exit codes of wrong inputs and interruptions."""
 
 import platform
+import re
 import sys
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated, cast
 
 import typer
 from rich.console import Console
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, expected_name
 from rig.cli import (
     bench,
     characterise,
@@ -30,6 +33,7 @@ from rig.cli import (
     zero,
 )
 from rig.cli import set as set_
+from rig.cli.plain_help import PlainCommand, PlainGroup
 from rig.cli.terminal import FAILED, OK, WRONG_INPUT, escape_controls
 from rig.log.errors import DamageError
 from rig.machine.installed_versions import version_of
@@ -41,30 +45,43 @@ _GROUPS = ("sensor", "fleet")
 
 app = typer.Typer(
     name="rig",
+    cls=PlainGroup,
     help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
+    epilog="`rig docs guide` builds the guide; begin with its tutorial of your own bench.",
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
-app.command("init", epilog=init.EXAMPLES)(init.init)
-app.command("zero", epilog=zero.EXAMPLES)(zero.zero_command)
-app.command("check", epilog=check.EXAMPLES)(check.check_command)
-app.add_typer(sensor.app, name=_GROUPS[0])
-app.command("run", epilog=run.EXAMPLES)(run.run)
-app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
-app.command("view", epilog=view.EXAMPLES)(view.view)
-app.command("set", epilog=set_.EXAMPLES)(set_.set_command)
-app.command("tune", epilog=tune.EXAMPLES)(tune.tune_command)
-app.command("characterise", epilog=characterise.EXAMPLES)(characterise.characterise_command)
-app.command("compare", epilog=compare.EXAMPLES)(compare.compare_command)
-app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
-app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
-app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
-app.add_typer(fleet.app, name=_GROUPS[1])
-app.command("import", epilog=import_.EXAMPLES)(import_.import_command)
-app.command("export", epilog=export.EXAMPLES)(export.export_command)
-app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
-app.command("report", epilog=report.EXAMPLES)(report.report)
+_SET_UP, _RUN, _EVALUATE, _EXCHANGE = (
+    "Set up a bench",
+    "Run the bridge",
+    "Evaluate",
+    "Exchange and read",
+)
+"""Heads of the commands in the help."""
+
+for _name, _function, _examples, _panel in (
+    ("demo", demo.demo, demo.EXAMPLES, _RUN),
+    ("init", init.init, init.EXAMPLES, _SET_UP),
+    ("zero", zero.zero_command, zero.EXAMPLES, _SET_UP),
+    ("check", check.check_command, check.EXAMPLES, _SET_UP),
+    ("tune", tune.tune_command, tune.EXAMPLES, _SET_UP),
+    ("run", run.run, run.EXAMPLES, _RUN),
+    ("bench", bench.bench, bench.EXAMPLES, _RUN),
+    ("view", view.view, view.EXAMPLES, _RUN),
+    ("set", set_.set_command, set_.EXAMPLES, _RUN),
+    ("diagnose", diagnose.diagnose, diagnose.EXAMPLES, _EVALUATE),
+    ("characterise", characterise.characterise_command, characterise.EXAMPLES, _EVALUATE),
+    ("compare", compare.compare_command, compare.EXAMPLES, _EVALUATE),
+    ("report", report.report, report.EXAMPLES, _EVALUATE),
+    ("replay", replay.replay_command, replay.EXAMPLES, _EVALUATE),
+    ("timing", timing.timing, timing.EXAMPLES, _EVALUATE),
+    ("import", import_.import_command, import_.EXAMPLES, _EXCHANGE),
+    ("export", export.export_command, export.EXAMPLES, _EXCHANGE),
+    ("docs", docs.docs, docs.EXAMPLES, _EXCHANGE),
+):
+    app.command(_name, epilog=_examples, rich_help_panel=_panel, cls=PlainCommand)(_function)
+app.add_typer(sensor.app, name=_GROUPS[0], rich_help_panel=_SET_UP)
+app.add_typer(fleet.app, name=_GROUPS[1], rich_help_panel=_EVALUATE)
 
 
 def _show_version(is_requested: bool) -> None:
@@ -121,9 +138,38 @@ def main() -> None:
         _print_error("interrupted")
         sys.exit(_INTERRUPTED)
     except _UsageError as error:
-        _refuse(error.format_message())
+        _refuse(_name_value(error.format_message(), sys.argv[1:]))
     else:
         sys.exit(ended if isinstance(ended, int) else OK)
+
+
+_INVALID = re.compile(
+    r"Invalid value for '(?:[^']* / )?(--?[\w-]+)[^']*': (?:Input should be )?(.*)"
+)
+
+
+def _name_value(message: str, words: Sequence[str]) -> str:
+    """A usage error with the value that is wrong, and what was expected."""
+    unknown = re.fullmatch(r"No such command '(.*)'\.", message)
+    if unknown is not None:
+        name = unknown[1]
+        return f"no command {name!r}, {expected_name(name, _commands(words))}"
+    found = _INVALID.fullmatch(message)
+    if found is None:
+        return message
+    option, expected = found.groups()
+    expected = re.sub(r"^a valid (\w+),.*", r"a \1 alone, without a unit", expected)
+    values = [after for word, after in pairwise(words) if word == option]
+    value = f" {values[-1]}" if values else ""
+    return f"{option}{value}: expected {expected}"
+
+
+def _commands(words: Sequence[str]) -> list[str]:
+    """Names of the commands, or of those of the group that was called."""
+    groups = {"sensor": sensor.app, "fleet": fleet.app}
+    called = groups.get(words[0] if words else "", app)
+    names = [str(item.name) for item in called.registered_commands]
+    return names if called is not app else [*names, *groups]
 
 
 def _refuse(why: str) -> None:

@@ -21,7 +21,7 @@ def report(
         bool, typer.Option("--pdf", help="Print it too; requires Chromium, Chrome or Edge.")
     ] = False,
 ) -> None:
-    """Write a page about a run: what ran, how well, timing, faults. One file, no network."""
+    """Report a run on a page: what ran, how well, timing, faults. One file, no network."""
     from rig.log.checksums import refuse_damage
     from rig.pages.browser_print import print_page
     from rig.pages.run_report import write_run_report

@@ -30,7 +30,7 @@ def run(
     configs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="CONFIG...", help="YAML file; several run as separate bridges at once."
+            metavar="CONFIG", help="YAML file; several run as separate bridges at once."
         ),
     ],
     out: Annotated[
@@ -48,8 +48,9 @@ def run(
     duration_s: Annotated[
         float | None,
         typer.Option(
+            metavar="S",
             min=0.001,
-            help="Length of the run in s; else the configuration's, or until Ctrl-C.",
+            help="Length of the run; else the configuration's, or until Ctrl-C.",
         ),
     ] = None,
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
@@ -141,7 +142,9 @@ def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
     if ended.state.mode is Mode.WAITING:
         messages = sorted({entry.message for entry in plan.config.signals.height.values()})
         stderr.print(
-            f"No valid height arrived: expected frames of {', '.join(messages)}.", style="red"
+            f"No valid height arrived: expected frames of {', '.join(messages)}. Is the bench "
+            "sending, are channel, bit rate and DBC right, and which frames were refused?",
+            style="red",
         )
         raise typer.Exit(FAILED)
     if ended.state.mode is Mode.SAFE:

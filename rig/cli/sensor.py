@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 from can_dbc.errors import InputError
+from rig.cli.plain_help import PlainCommand, PlainGroup
 from rig.cli.progress import progress_bar
 from rig.cli.terminal import (
     Bitrate,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from rig.sensors.canopen_device import CanOpenDevice
 
 app = typer.Typer(
+    cls=PlainGroup,
     help="Sensors on the bus without a DBC: find, describe and configure them.",
     no_args_is_help=True,
 )
@@ -42,7 +44,9 @@ SET_EXAMPLES = (
     "`rig sensor set --restore sensor-5-before.yaml` · `rig sensor set 5 --new`"
 )
 
-ListenSeconds = Annotated[float, typer.Option(min=0.0, max=600.0, help="How long to listen first.")]
+ListenSeconds = Annotated[
+    float, typer.Option(metavar="S", min=0.0, max=600.0, help="How long to listen first.")
+]
 EdsFiles = Annotated[
     list[str] | None,
     typer.Option(
@@ -51,10 +55,10 @@ EdsFiles = Annotated[
     ),
 ]
 CycleMs = Annotated[
-    int | None, typer.Option(min=1, max=65_535, help="Time between two measurements.")
+    int | None, typer.Option(metavar="MS", min=1, max=65_535, help="Time between two measurements.")
 ]
 HeartbeatMs = Annotated[
-    int | None, typer.Option(min=1, max=65_535, help="Time between two heartbeats.")
+    int | None, typer.Option(metavar="MS", min=1, max=65_535, help="Time between two heartbeats.")
 ]
 Before = Annotated[
     Path | None,
@@ -65,7 +69,7 @@ Before = Annotated[
 ]
 
 
-@app.command("scan", epilog=SCAN_EXAMPLES)
+@app.command("scan", epilog=SCAN_EXAMPLES, cls=PlainCommand)
 def scan_command(
     interface: Interface = "socketcan",
     channel: Channel = "can0",
@@ -114,7 +118,7 @@ def scan_command(
         )
 
 
-@app.command("set", epilog=SET_EXAMPLES)
+@app.command("set", epilog=SET_EXAMPLES, cls=PlainCommand)
 def set_command(
     node_id: Annotated[
         int | None, typer.Argument(metavar="[NODE]", min=1, max=127, help="CANopen node id.")

@@ -19,7 +19,7 @@ def set_command(
     assignments: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[KEY=VALUE...]",
+            metavar="KEY=VALUE",
             help="Keys of the configuration under observers or supervision.",
         ),
     ] = None,
@@ -41,8 +41,11 @@ def set_command(
 
     given = {"acknowledge": acknowledge, "arm": arm, "disarm": disarm}
     requests = [request for request, is_given in given.items() if is_given]
-    if len(requests) + bool(assignments) != 1:
-        raise InputError("rig set: expected KEY=VALUE, --acknowledge, --arm or --disarm")
+    named = [*(f"--{request}" for request in requests), *(["KEY=VALUE"] if assignments else [])]
+    if not named:
+        raise InputError("expected KEY=VALUE, --acknowledge, --arm or --disarm")
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)}: expected one of them")
     if requests:
         ask(run, {"request": requests[0], "by": user_name()})
         console.print(f"Requested: {requests[0]}.")

@@ -42,7 +42,9 @@ def run_side_by_side(
     names = [config.stem for config in configs]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise InputError(f"{twice[0]}: two configurations of this name, expected different ones")
+        raise InputError(
+            f"{twice[0]}: two configurations of this name, or one twice; expected different names"
+        )
     for name in names:
         refuse_full(folder / name)
     bridges: dict[str, subprocess.Popen[str]] = {}

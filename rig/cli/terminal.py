@@ -17,7 +17,7 @@ OK, FAILED, WRONG_INPUT = 0, 1, 2
 EXIT_CODES = {
     OK: "Done.",
     FAILED: "A run ended in its safe state, without a height or with a log that lacks ticks; a "
-    "check, replay, comparison or tolerance failed; a run's files are damaged.",
+    "check, replay, tolerance or run of a fleet failed; a run's files are damaged.",
     WRONG_INPUT: "An input is wrong: one line on standard error names file, key, value and what "
     "was expected.",
     130: "Interrupted by Ctrl-C where there was nothing to end in order.",
@@ -30,9 +30,9 @@ ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
 StrutOfRun = Annotated[str | None, typer.Option(metavar="NAME", help="Which strut of a run.")]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the same as JSON, and nothing else.")]
-Interface = Annotated[str, typer.Option(help="python-can's name of the interface.")]
-Channel = Annotated[str, typer.Option(help="Channel of the interface.")]
-Bitrate = Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")]
+Interface = Annotated[str, typer.Option(metavar="NAME", help="python-can's name of the interface.")]
+Channel = Annotated[str, typer.Option(metavar="NAME", help="Channel of the interface.")]
+Bitrate = Annotated[int, typer.Option(metavar="BIT/S", min=1, help="Bit rate in bit/s.")]
 
 
 def escape_controls(text: str) -> str:

@@ -39,22 +39,25 @@ Run = Annotated[
     ),
 ]
 ResidualRms = Annotated[
-    float | None, typer.Option(min=0.0, help="Without a run: RMS of the residual force, N.")
+    float | None,
+    typer.Option(metavar="N", min=0.0, help="Without a run: RMS of the residual force."),
 ]
 HighestFrequency = Annotated[
-    float | None, typer.Option(min=0.0, help="Without a run: its highest frequency, Hz.")
+    float | None, typer.Option(metavar="HZ", min=0.0, help="Without a run: its highest frequency.")
 ]
 NoiseStd = Annotated[
     float | None,
     typer.Option(
+        metavar="M",
         min=1e-12,
         max=1.0,
-        help="Without a run: standard deviation of the height, m; absent: by the DBC's steps.",
+        help="Without a run: standard deviation of the height; absent: by the DBC's steps.",
     ),
 ]
 GainMargin = Annotated[
     float | None,
     typer.Option(
+        metavar="FACTOR",
         min=1.0,
         max=20.0,
         help="Factor by which the model may respond more, or less, and stay stable; 1.1 for "
@@ -75,9 +78,11 @@ def tune_command(
     residual_n: ResidualRms = None,
     up_to_hz: HighestFrequency = None,
     noise_std_m: NoiseStd = None,
-    observer: Annotated[str, typer.Option(help="kalman (noise-aware), or pi.")] = "kalman",
+    observer: Annotated[
+        str, typer.Option(metavar="KIND", help="kalman (noise-aware), or pi.")
+    ] = "kalman",
     damping_ratio: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Least that a pole keeps.")
+        float, typer.Option(metavar="RATIO", min=0.0, max=1.0, help="Least of all poles.")
     ] = 0.1,
     gain_margin: GainMargin = None,
     out: Annotated[
@@ -90,7 +95,7 @@ def tune_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Find the gains of the observers with the smallest expected error of the force."""
+    """Tune the observers: the gains with the smallest expected error of the force."""
     from rig.pages.tuning_picture import draw_tuning
     from rig.plan.load import load_plan
     from rig.tuning.gains import KINDS, Aim
@@ -132,7 +137,7 @@ def _source(
             )
         return run
     if not residual_n or not up_to_hz:
-        raise InputError("rig tune: expected --run RUN, or --residual-n and --up-to-hz above zero")
+        raise InputError("expected --run RUN, or --residual-n and --up-to-hz above zero")
     return StatedExpectation(residual_n, up_to_hz, noise_std_m)
 
 

@@ -23,6 +23,7 @@ _PORT, _FOXGLOVE_PORT = 8321, 8765
 Port = Annotated[
     int | None,
     typer.Option(
+        metavar="PORT",
         min=0,
         max=65535,
         help=f"Port on this machine; 0 takes a free one. {_PORT} by default, Foxglove's is "
@@ -48,7 +49,7 @@ FoxgloveFlag = Annotated[
 
 
 def view(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of runs.")],
     model: Annotated[
         list[str] | None,
         typer.Option(metavar="MODEL", help="Draw this model's law too; once for each model."),
@@ -70,6 +71,9 @@ def view(
             raise InputError("--foxglove: expected neither --control nor --model with it")
         _publish(runs, _FOXGLOVE_PORT if port is None else port)
         return
+    for run in runs:
+        if run.is_file():
+            raise InputError(f"{run}: is a file, expected a run's folder")
     models = {name: load_named_model(name, Path()) for name in model or ()}
     token = secrets.token_urlsafe(16) if control else None
     server = ViewServer(runs, models, _PORT if port is None else port, token)

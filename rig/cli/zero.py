@@ -37,7 +37,9 @@ TareOf = Annotated[
         "pulls or pushes it.",
     ),
 ]
-ListenSeconds = Annotated[float, typer.Option(min=0.1, max=600.0, help="How long to listen.")]
+ListenSeconds = Annotated[
+    float, typer.Option(metavar="S", min=0.1, max=600.0, help="How long to listen.")
+]
 FromRun = Annotated[
     Path | None, typer.Option(metavar="RUN", help="A run at rest, instead of the bus now.")
 ]
@@ -51,7 +53,7 @@ def zero_command(
     listen_s: ListenSeconds = 2.0,
     run: FromRun = None,
     is_remounted: Annotated[
-        bool, typer.Option("--remounted", help="The zero before does not count any more.")
+        bool, typer.Option("--remounted", help="The sensor was moved since: the zero found before is not used.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

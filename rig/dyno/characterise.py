@@ -113,7 +113,10 @@ def _read_strut(
         if recording.heights_m.shape[1] > 1:
             raise InputError(f"{path}: holds several struts, expected a file of one")
         if cells_n is None:
-            raise InputError(f"{path}: has no strut_force_n, expected a load cell's force")
+            raise InputError(
+                f"{path}: has no strut_force_n, expected the force of a load cell "
+                "in a column of that name"
+            )
         return "", recording.heights_m[:, 0], cells_n[:, 0], "load cell"
     run = read_run(path)
     config = run.header.get("config", {})

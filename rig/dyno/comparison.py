@@ -164,7 +164,10 @@ def _common_figures(items: Sequence[Characteristics]) -> dict[str, tuple[str, li
     }
     if not common:
         names = ", ".join(item.name for item in items)
-        raise InputError(f"{names}: no step of one speed and amplitude in common")
+        raise InputError(
+            f"{names}: no step of one speed and amplitude in common, expected "
+            "records of the same test"
+        )
     return common
 
 

@@ -84,8 +84,10 @@ def open_rows(
         raise InputError(f"{name}: encoding: {error}, expected e.g. utf-8") from error
     except (UnicodeError, csv.Error) as error:
         encoding = layout.encoding.removesuffix("-sig").upper()
-        reason = " ".join(str(error).split())
-        raise InputError(f"{name}: is no such text, expected {encoding}: {reason}") from error
+        raise InputError(
+            f"{name}: is no text in {encoding}, expected one, or its encoding in the mapping "
+            "(table.encoding)"
+        ) from error
 
 
 def _lines(name: str, file: TextIO) -> Iterator[str]:

@@ -46,9 +46,9 @@ def refuse_full(folder: Path, claimed_by: Path | None = None) -> None:
     Raises:
         InputError: It is not empty, or no folder.
     """
-    if folder.exists() and (
-        not folder.is_dir() or any(path != claimed_by for path in folder.iterdir())
-    ):
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, expected a new or an empty folder")
+    if folder.exists() and any(path != claimed_by for path in folder.iterdir()):
         raise InputError(f"{folder}: is not empty, expected a new or an empty folder")
 
 

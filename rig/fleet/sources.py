@@ -71,7 +71,7 @@ def find_sources(given: Sequence[str], pattern: str | None = None) -> list[RunSo
     for location in given:
         there = list(_find_in(location, compiled, pattern))
         if not there:
-            raise InputError(f"{location}: no runs, expected run folders or CSV files")
+            raise InputError(f"{location}: no runs there, expected run folders or CSV files")
         found |= {source.url: source for source in there}
     return sorted(
         found.values(), key=lambda item: (item.bench, item.date or item.changed, item.url)
@@ -194,7 +194,10 @@ def _fields(
         return {"bench": _FORBIDDEN.sub("_", above)}
     found = compiled.fullmatch(inside.removesuffix(".csv"))
     if found is None:
-        raise InputError(f"{inside}: does not fit --path {pattern!r}")
+        raise InputError(
+            f"{inside}: does not fit --path {pattern!r}, expected as many folders in the pattern "
+            "as in the path of each run"
+        )
     return found.groupdict()
 
 

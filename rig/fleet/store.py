@@ -159,7 +159,7 @@ def connect(store: Path) -> Generator[Any]:
         InputError: There is no store, DuckDB is not installed, or it refuses what it is asked for.
     """
     if not any((store / "runs").rglob("*.parquet")):
-        raise InputError(f"{store}: no runs in it, expected what `rig fleet SOURCE` wrote")
+        raise InputError(f"{store}: no runs in it, expected what `rig fleet run` wrote")
     if _duckdb is None:
         raise InputError(missing_package("duckdb", "pip install -e '.[fleet]'"))
     # A SELECT can write as well (`WITH a AS (COPY ... TO ...)`), and a folder that DuckDB may read
@@ -172,7 +172,11 @@ def connect(store: Path) -> Generator[Any]:
         connection.execute("SET lock_configuration = true")
         yield connection
     except (_duckdb.Error, pa.ArrowException, OSError) as error:
-        raise InputError(f"{store}: {str(error).splitlines()[0]}") from error
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        hints = [line for line in lines[1:] if line.startswith(("Did you mean", "Candidate"))]
+        raise InputError(
+            f"{store}: {' '.join([lines[0], *hints])} (the views are runs, effects and values)"
+        ) from error
     finally:
         connection.close()
 

@@ -35,7 +35,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
         InputError: The FMU, the mapping or the folder is wrong, or a mass is missing.
     """
     if mass_kg is not None and not 0.0 < mass_kg < math.inf:
-        raise InputError(f"--mass-kg {mass_kg}: expected a mass")
+        raise InputError(f"--mass-kg {mass_kg}: expected a number above zero")
     refuse_full(out)
     content = read_program(source)
     description = read_description(content, source)

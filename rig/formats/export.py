@@ -26,6 +26,7 @@ from rig.formats.mts import is_mts
 from rig.formats.parquet import read_parquet, write_parquet
 from rig.formats.run_content import channel_of, path_inside
 from rig.log.candump import format_frame
+from rig.log.checksums import refuse_damage
 from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE
 from rig.log.reader import RunFolder, read_run
 
@@ -50,6 +51,8 @@ def export_run(
     if out.exists():
         raise InputError(f"{out}: exists, expected a new file")
     run = read(folder)
+    if run.damage and run.steps.num_rows == 0:  # nothing of it could be exported
+        refuse_damage(folder, run.damage)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with _removed_on_failure(out):

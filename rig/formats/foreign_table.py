@@ -53,13 +53,15 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
         for output, column in zip(outputs, readings, strict=True)
     ]
     names = ("t_s", *(output.name for output in outputs))
-    _write_csv(out, names, [t_s, *values])
     assumptions += [output.words for output in outputs]
-    missing = int(np.count_nonzero(np.isnan(values[0])))
-    if missing:
+    missing = np.isnan(values[0])
+    if missing.any():
         assumptions.append(
-            f"height_m is missing in {missing} of {len(t_s)} rows; its cells are empty"
+            f"{np.count_nonzero(missing)} of {len(t_s)} rows have no height and are left out"
         )
+        t_s, values = t_s[~missing], [value[~missing] for value in values]
+        _check_times(source, t_s)
+    _write_csv(out, names, [t_s, *values])
     assumptions += _assume_signs(mapping)
     assumptions += preflight(t_s, dict(zip(names[1:], values, strict=True)))
     duration_s = float(t_s[-1] - t_s[0])

@@ -139,8 +139,10 @@ def read_mf4(source: Path) -> RunContent:
     try:
         mdf = asammdf.MDF(str(source))
     except (OSError, ValueError, LookupError, asammdf.blocks.utils.MdfException) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{source}: is no MF4 file: {reason}") from error
+        raise InputError(
+            f"{source}: is no MF4 file, expected what rig export wrote; a table requires --mapping "
+            "FILE, a file of MTS --rebound, a bus log --config FILE, an FMU --fmu"
+        ) from error
     with closing(mdf):
         files = {
             str(block.file_name): cast("bytes", mdf.extract_attachment(number)[0])

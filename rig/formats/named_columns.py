@@ -83,8 +83,10 @@ def _read_file(source: Path) -> Mapping[str, Array]:
         ) from error
     except Exception as error:
         # Foreign readers raise anything on a file that is cut or malicious.
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{source}: is no such file, or is damaged: {reason}") from error
+        kind = source.suffix.lstrip(".").upper()
+        raise InputError(
+            f"{source}: is no valid {kind} file, or is damaged: export it again"
+        ) from error
 
 
 def _find_column(source: Path, table: Mapping[str, Array], key: str, name: ColumnName) -> Array:

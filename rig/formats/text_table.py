@@ -153,9 +153,7 @@ def _column_names(source: Path, rows: Iterator[Row], table: TextLayout) -> list[
 def _column_index(source: Path, key: str, column: ColumnName, names: list[str] | None) -> int:
     if isinstance(column, int):
         if names is not None and column > len(names):
-            raise InputError(
-                f"{source}: {key}.column = {column}, but there are {len(names)} columns"
-            )
+            raise InputError(f"{source}: {key}.column = {column}, expected 1 to {len(names)}")
         return column - 1
     if names is None:
         raise InputError(
@@ -164,7 +162,10 @@ def _column_index(source: Path, key: str, column: ColumnName, names: list[str] |
     if names.count(column) != 1:
         wrong = "twice" if column in names else "not there"
         shown = ", ".join(name[:40] for name in names[:20] if name)
-        raise InputError(f"{source}: {key}.column = {column!r} is {wrong}, expected one of {shown}")
+        hint = "; is table.separator the file's own?" if len(names) == 1 else ""
+        raise InputError(
+            f"{source}: {key}.column = {column!r} is {wrong}, expected one of {shown}{hint}"
+        )
     return names.index(column)
 
 

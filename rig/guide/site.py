@@ -5,6 +5,7 @@ there when the site is built, so that no page can contradict the program. Everyt
 is in its folder: pages and search work from a file, without a network.
 """
 
+import importlib
 import logging
 import re
 import shutil
@@ -109,6 +110,8 @@ def build_site(folder: Path, blocks: Mapping[str, Block]) -> Path:
     build, load = _mkdocs()
     try:
         folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(f"{folder}: is a file, expected a new folder") from None
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
     with tempfile.TemporaryDirectory() as name:
@@ -139,15 +142,15 @@ def _build_strictly(build: Callable[[], None]) -> None:
 
 def _mkdocs() -> tuple[Callable[[Any], None], Callable[..., Any]]:
     try:
-        import material  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport, reportMissingImports]
-        from mkdocs.commands.build import build  # noqa: PLC0415
-        from mkdocs.config import load_config  # noqa: PLC0415
+        importlib.import_module("material")
+        build = importlib.import_module("mkdocs.commands.build").build
+        load = importlib.import_module("mkdocs.config").load_config
     except ImportError:
         raise InputError(
             f"rig docs requires MkDocs Material: `pip install -e '.[guide]'`, or read {PAGES} as "
             "it is, in Markdown"
         ) from None
-    return build, load_config
+    return build, load
 
 
 def _fill(source: Path, blocks: Mapping[str, Block]) -> None:
@@ -231,6 +234,5 @@ def _settings(source: Path, site: Path) -> dict[str, Any]:
 
 def _format_math(source: str, *_: object, **__: object) -> str:
     """An equation as MathML, which browsers draw by themselves."""
-    from latex2mathml.converter import convert  # noqa: PLC0415
-
+    convert = importlib.import_module("latex2mathml.converter").convert
     return f'<div class="equation">{convert(source, display="block")}</div>'

@@ -44,7 +44,7 @@ def refuse_damage(folder: Path, damage: Iterable[Damage]) -> None:
     """
     text = "; ".join(item.text for item in damage)
     if text:
-        raise DamageError(f"{folder}: damaged: {text}")
+        raise DamageError(f"{folder}: damaged: {text}: copy the run again from its origin")
 
 
 def find_damage(folder: Path) -> tuple[Damage, ...]:

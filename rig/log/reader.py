@@ -145,15 +145,22 @@ def read_run(folder: Path) -> RunFolder:
         LogError: It is no run, or a file of it is damaged beyond its end.
     """
     if not folder.is_dir():
-        raise LogError(f"{folder}: is no folder, expected a run")
+        kind = "is a file" if folder.exists() else "no such folder"
+        raise LogError(f"{folder}: {kind}, expected the folder of a run")
     for name in (RUN_FILE, FRAMES_FILE, STEPS_FILE):
         if not (folder / name).is_file():
-            raise LogError(f"{folder}: {name} is missing, expected a run")
+            raise LogError(f"{folder}: {name} is missing, expected a run{_runs_below(folder)}")
     header = read_header(folder)
     damage = find_damage(folder)
     altered = [item.name for item in damage if not item.is_readable]
     steps = _read_steps([it for it in parts(folder, STEPS_FILE) if it.name not in altered])
     return RunFolder(folder, header, steps, header["epoch_ns"], damage)
+
+
+def _runs_below(folder: Path) -> str:
+    """What an error adds where the folders of a folder are runs."""
+    runs = sorted(path.parent.name for path in folder.glob(f"*/{RUN_FILE}"))[:3]
+    return f", such as {', '.join(str(folder / name) for name in runs)}" if runs else ""
 
 
 def read_header(folder: Path) -> RunHeader:
@@ -168,8 +175,11 @@ def read_header(folder: Path) -> RunHeader:
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
     if schema not in _READ_SCHEMAS:
+        if schema is None:
+            raise LogError(f"{path}: has no schema, expected the run.yaml of a run")
         raise LogError(
-            f"{path}: schema: {str(schema)[:40]}: expected {RUN_SCHEMA}, a run of this version"
+            f"{path}: schema {str(schema)[:40]}: expected {RUN_SCHEMA}: use the version of rig "
+            "that wrote it, or record the run again"
         )
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:

@@ -56,6 +56,7 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
     follower = RunFollower(folder)
     follower.update(_ALL_STEPS)
     if not follower.steps:
+        refuse_damage(folder, damage)
         raise InputError(f"{folder}: holds no tick, expected a run to report on")
     struts = list(header.get("config", {}).get("observers", {}))
     ending = header.get("ending") or {}

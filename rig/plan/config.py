@@ -68,7 +68,12 @@ class OneOf:
         self, _source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         choices = {f"<{kind}>": handler.generate_schema(it) for kind, it in self.choices.items()}
-        return tagged_union_schema(choices, self._kind)
+
+        def select(data: object) -> str:
+            return self._kind(data)
+
+        select.__name__ = self._key  # which an error names
+        return tagged_union_schema(choices, select)
 
 
 class HeightSignal(MeasuredSignal):

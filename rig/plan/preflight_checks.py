@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from can_dbc.bus_load import frame_time_s
-from can_dbc.codec import si_step
+from can_dbc.codec import si_range, si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton, shipped_models
@@ -75,6 +75,8 @@ def check(plan: Plan) -> list[Finding]:
         *[_rate(message, plan.period_ns) for message in heights],
         *map(_sample_times, channel_of.values()),
         *_model(plan),
+        *_gravity(plan),
+        *_lengths(plan),
         *[_zero(plan, channel) for channel in plan.heights],
         *_resolution(plan),
         *[
@@ -108,6 +110,13 @@ def errors(plan: Plan) -> list[Finding]:
     return [finding for finding in check(plan) if finding.severity is Severity.ERROR]
 
 
+_LONGEST_STRUT_M = 20.0
+"""Longer than any strut of a vehicle: such a length is in mm."""
+
+_LEAST_GRAVITY, _LARGEST_GRAVITY = 9.76, 9.84
+"""On the Earth's surface, m/s² (9.764 to 9.834)."""
+
+
 def _message(channel: Channel) -> Message:
     if channel.message is None:
         raise ValueError(f"{channel.key}: expected a channel on a bus")
@@ -129,6 +138,32 @@ def _model(plan: Plan) -> list[Finding]:
     text = f"{plan.config.model} is an example that comes with rig, not this bench: expected a "
     text += "file with its own masses, lengths, stiffness and damping"
     return [Finding(Severity.WARNING, "model", text)]
+
+
+def _gravity(plan: Plan) -> list[Finding]:
+    """Whether gravity is that of the Earth, or none: a wrong unit makes it something else."""
+    gravity = plan.model.gravity_m_per_s2
+    if gravity == 0.0 or _LEAST_GRAVITY <= abs(gravity) <= _LARGEST_GRAVITY:
+        return []
+    text = f"{gravity:g} m/s², expected 9.81, or 0 for a horizontal guide"
+    return [Finding(Severity.WARNING, "gravity of the model", text)]
+
+
+def _lengths(plan: Plan) -> list[Finding]:
+    """Free lengths that no strut of a bench has, or that its sensor could not show."""
+    found: list[Finding] = []
+    for height in plan.heights:
+        length_m = plan.struts[height.strut].free_length_m
+        low, high = si_range(_message(height), height.signal, height.quantity.dimension)
+        span = high - low
+        if abs(length_m) <= _LONGEST_STRUT_M and low - span <= length_m <= high + span:
+            continue
+        text = (
+            f"free_length_m is {length_m:g}, and the sensor shows {low:.3g} to {high:.3g} m: "
+            "expected a length in metres that it can show"
+        )
+        found.append(Finding(Severity.WARNING, f"length of {height.name}", text))
+    return found
 
 
 def _zero(plan: Plan, height: Channel) -> Finding:

@@ -62,8 +62,8 @@ def check_fits(recording: Recording, spec: ModelSpec) -> None:
     struts = len(spec.struts)
     if recording.heights_m.shape[1] != struts:
         raise RecordingError(
-            f"{recording.name}: {recording.heights_m.shape[1]} heights, model {spec.name} has "
-            f"{struts} struts, expected one height for each"
+            f"{recording.name}: {recording.heights_m.shape[1]} height(s), but model {spec.name} "
+            f"has {struts} strut(s), expected one height for each: is it the model of this run?"
         )
     if recording.duration_s > _LONGEST_DURATION_S:
         raise RecordingError(

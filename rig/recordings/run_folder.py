@@ -44,7 +44,8 @@ def read_run(folder: Path) -> Recording:
     for channel, (t_s, _) in zip(plan.heights, heights, strict=True):
         if len(t_s) < 2:
             raise InputError(
-                f"{folder}: no {_message(channel).name} with the height of strut {channel.name}"
+                f"{folder}: holds no {_message(channel).name} with the height of strut "
+                f"{channel.name}, expected a run in which the bench sent"
             )
     t_s = heights[0][0]
     half_s = 0.5 * float(np.median(np.diff(t_s)))

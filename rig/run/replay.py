@@ -16,7 +16,8 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.counts import Conditions
-from rig.log.checksums import Damage
+from rig.log.checksums import Damage, refuse_damage
+from rig.log.errors import LogError
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import RUN_SCHEMA, RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
@@ -78,7 +79,11 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     own = plan_of_header(folder, run_folder.header)
     plan = plan or own
     bridge = build_bridge(plan, sending=False)
-    frames = read_frame_columns(run_folder.frame_files, run_folder.epoch_ns)
+    try:
+        frames = read_frame_columns(run_folder.frame_files, run_folder.epoch_ns)
+    except LogError:
+        refuse_damage(folder, run_folder.damage)
+        raise
     ticks = _ticks(run_folder, frames, plan.period_ns)
     columns = LogColumns(plan.strut_names, plan.channels)
     rows = StepRows(columns.names)

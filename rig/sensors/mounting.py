@@ -113,8 +113,8 @@ def readings_of(run: Path, plan: Plan, name: str) -> Readings:
     if len(values) < _FEWEST:
         message = "" if channel.message is None else channel.message.name
         raise InputError(
-            f"{run}: {len(values)} valid frames of {message}, expected at least {_FEWEST}: is the "
-            "sensor powered, and its message the right one?"
+            f"height or force of {name}: {len(values)} valid frames of {message}, expected at "
+            f"least {_FEWEST}: is the sensor powered, the bus the right one, and its message too?"
         )
     return summarise(t_s, values)
 
@@ -151,7 +151,8 @@ def find_zero(
     if readings.span > _MOST_MOTION_M:
         raise InputError(
             f"the reading moves over {readings.span * 1e3:.3g} mm in {readings.duration_s:.3g} s, "
-            "expected a strut at rest"
+            f"expected at most {_MOST_MOTION_M * 1e3:g} mm: bring the strut to rest, and measure "
+            "again"
         )
     zero: dict[str, object] = {"reads": round(readings.mean, 7), "at_m": length_m}
     last = None if is_remounted else before.zero

@@ -93,6 +93,11 @@ def tune(
             f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
             "a height of each strut"
         )
+    if isinstance(source, StatedExpectation) and source.up_to_hz >= 0.5e9 / plan.period_ns:
+        raise InputError(
+            f"--up-to-hz {source.up_to_hz:g}: expected less than half of rate_hz, "
+            f"{0.5e9 / plan.period_ns:g}"
+        )
     plant = build_plant(plan)
     heights_m = [strut.free_length_m for strut in plan.struts]
     responses = strut_responses(plant, heights_m)
@@ -211,7 +216,7 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path, model: str | N
     if late:
         supervision = with_delay(plan, max(late.values())).config.supervision
         content = parse_mapping(text, str(plan.source))
-        ages = {
+        ages: dict[str, object] = {
             "stale_after_s": round(supervision.stale_after_s, 9),
             "safe_after_s": round(supervision.safe_after_s, 9),
         }
@@ -221,10 +226,9 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path, model: str | N
             top["supervision"] = ages
         heights = cast("dict[str, dict[str, object]]", content["signals"])["height"]
         # A model of one strut leaves its name out.
-        changes += [
-            (["signals", "height", *([name] if name in heights else [])], {"delay_s": delay_s})
-            for name, delay_s in late.items()
-        ]
+        for name, delay_s in late.items():
+            place = ["signals", "height", *([name] if name in heights else [])]
+            changes.append((place, {"delay_s": delay_s}))
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(edit_keys(text, changes))
