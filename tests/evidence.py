@@ -53,6 +53,7 @@ def write_evidence(name: str, title: str, text: str, tables: Sequence[str], comm
         command: What measured them.
     """
     path = FOLDER / f"{name}.md"
+    path.parent.mkdir(exist_ok=True)
     parts = [f"# {title}", text.strip(), *tables, f"Measured with\n\n    {command}\n\n{_origin()}"]
     path.write_text("\n\n".join(parts) + "\n", "utf-8")
     return path

@@ -325,8 +325,8 @@ def grid_part(rows):
     low, high = np.percentile(held, [5, 95])
     words = (
         f"{len(rows)} benches of the grid: {_span(MASSES_KG, 1)} kg, {_span(NATURAL_HZ, 1)} Hz, "
-        f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights a second. Errors are held "
-        "against those of the published gains, scaled with the mass:"
+        f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights a second. Errors are "
+        "held against those of the published gains, scaled with the mass:"
     )
     return [
         words,

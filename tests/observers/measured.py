@@ -14,6 +14,7 @@ import numpy as np
 
 from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
+from rig.bridge.values import Mode
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
@@ -33,11 +34,13 @@ TEXT = """
 The observers follow measured records, and their force is held against another measure of it. EMPS
 is a positioning stage without a spring; its model has mass and viscous damping and lacks its dry
 friction. The force of its friction was not measured: the estimate is held against the force
-smoothed over the whole record. The MR damper was measured on a dyno with a load cell. Its record is
-made a free body's: the applied force is what a body of 100 kg at the smoothed motion would need,
-and the estimate, from that force and the raw displacement, is held against the load cell. Errors
-are RMS from 0.5 s on, over the standard deviation of the force; `lost` is an error of more than
-twice that deviation. Gains are tuned on the same record.
+smoothed afterwards. The MR damper was measured on a dyno with a load cell. Its record is made a
+free body's: the applied force is what a body of 100 kg at the smoothed motion would need, and the
+estimate, from that force and the raw displacement, is held against the load cell. Errors are RMS,
+over the standard deviation of the force, in the longest stretch that a first observer follows
+without a break but for its first 0.5 s, at the ticks where the estimate is valid; their share is in
+parentheses where it is less than all. `lost` is an error of more than twice that deviation. Gains
+are tuned on the same record.
 """
 
 MODEL = """
@@ -74,7 +77,8 @@ def compare(name, record, force_n=None):
     seen = longest_stretch(follow(record, record.height_m, start), Path(name), STRUT, mobility)
     noise_std_m, residual_n = residual_force(seen, mobility)
     smoothed = np.interp(seen.tick_s, seen.t_s, residual_n) + seen.law_force_n
-    first = len(record.height_m) - len(seen.tick_s)
+    # The stretch may end, and begin again, where the bench suddenly moves more.
+    first = round(1e9 * seen.tick_s[0] / record.period_ns)
     truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
     expectation = Expectation(noise_std_m, *spectrum(seen.t_s, residual_n), name)
     timing = SampleTiming(record.period_ns)
@@ -83,18 +87,23 @@ def compare(name, record, force_n=None):
     )
     settled = round(0.5e9 / record.period_ns)
     deviation = np.std(truth[settled:])
-    errors = {}
+    errors, valid = {}, {}
     for kind, observer in (
         ("published", paper_observer(bench.mobility_per_kg, bench.force_limit_n)),
         *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
     ):
-        force = follow(record, record.height_m, observer).column(f"{STRUT}.force_n").to_numpy()
-        missed = (force[first : first + len(truth)] - truth)[settled:]
-        errors[kind] = np.sqrt(np.mean(missed**2)) / deviation
+        steps = follow(record, record.height_m, observer)[first : first + len(truth)][settled:]
+        is_valid = steps.column("mode").to_numpy() == Mode.RUNNING
+        missed = steps.column(f"{STRUT}.force_n").to_numpy() - truth[settled:]
+        errors[kind] = np.sqrt(np.mean(missed[is_valid] ** 2)) / deviation
+        valid[kind] = np.mean(is_valid)
     if force_n is not None:
         missed = (smoothed - truth)[settled:]
         errors["smoothed"] = np.sqrt(np.mean(missed**2)) / deviation
-    figures = [f"{kind} {100 * error:.1f} %" for kind, error in errors.items()]
+    figures = [
+        f"{kind} {100 * error:.1f} % ({100 * valid.get(kind, 1.0):.1f} % valid)"
+        for kind, error in errors.items()
+    ]
     print(
         f"{name}: noise {1e6 * noise_std_m:.2g} um, {', '.join(figures)} of the force's deviation "
         f"{deviation:.3g} N",
@@ -105,14 +114,16 @@ def compare(name, record, force_n=None):
         "the smoothed force" if force_n is None else "the load cell",
         f"{1e6 * noise_std_m:.2g}",
         f"{deviation:.3g}",
-        *(_percent(errors.get(kind)) for kind in KINDS),
+        *(_cell(errors.get(kind), valid.get(kind, 1.0)) for kind in KINDS),
     )
 
 
-def _percent(error):
+def _cell(error, valid):
     if error is None:
         return ""
-    return f"{100 * error:.1f} %" if error < LOST else "lost"
+    if error > LOST:
+        return "lost"
+    return f"{100 * error:.2g} %" + (f" ({100 * valid:.1f} % valid)" if valid < 0.9995 else "")
 
 
 def emps(folder, name):
