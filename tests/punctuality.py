@@ -23,9 +23,9 @@ from tests.evidence import add_page_option, command_line, table, write_evidence
 TEXT = """
 The bridge and a loop that does nothing run in turn at 1 kHz, for the same time each, with the
 simulated bench in the bridge's process and a process on each core that is busy for {busy:.0%} of
-the time. A tick is missed when its deadline has passed before the loop is there. Only the two runs
-of one pair can be compared: hours differ more than programs do. The causes are those that `rig
-timing` computes from the kernel's accounting. SCHED_FIFO was {granted}.
+the time. A tick is missed when the loop is late by its whole period. Only the two runs of one pair
+can be compared: hours differ more than programs do. The causes are those that `rig timing` computes
+from the kernel's accounting. SCHED_FIFO was {granted}.
 """
 
 NAMES = {"bare": "empty loop", "bridge": "bridge"}
