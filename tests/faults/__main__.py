@@ -25,7 +25,7 @@ without the fault. Faults in combination are not in this table.
 
 PROMISE_TEXT = """
 A node on the bus decodes the bridge's frames with cantools; neither the log nor the bridge's own
-values are used. The bench is the reference case, in simulated time, and each event begins 2 s after
+values are used. The bench is the reference case, in simulated time, and most events begin 2 s after
 the start. No force with `VALID` = 1 may err by more than three times the largest error of the
 settled run; the test fails otherwise. Modes and times are those of the noise-aware observer. The
 largest valid error is over that of the settled run, for published PI, damped PI and noise-aware
