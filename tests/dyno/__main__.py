@@ -10,11 +10,11 @@ from tests.dyno.dynos import drawn, found
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
-{cases} sine records of dampers are drawn at random, by the laws {laws}. Noise is white. `rig
-characterise` computes the figures of each record with 95 % intervals, and the true values are
+{cases} sine records of dampers are drawn at random, by the laws {laws}. Noise is white.
+`rig characterise` computes the figures of each record with 95 % intervals, and the true values are
 known. The table has the share of the intervals that hold the truth, over all laws and by law, and
-in parentheses the median half width over the value. Correlated noise, and the errors of a real
-sensor, are not in this study.
+in parentheses the median half width over the value, unless the value is zero. Correlated noise, and
+the errors of a real sensor, are not in this study.
 """
 
 
@@ -47,9 +47,9 @@ def coverage(hits, name):
 
 
 def cell(rows):
-    """Share of the intervals that hold the truth, and median half width over the value."""
+    """Share of the intervals that hold the truth, and median half width over a value not zero."""
     share, width = np.mean([row[0] for row in rows]), np.median([row[2] for row in rows])
-    return f"{share:.3f} ({100 * width:.2g} %)"
+    return f"{share:.3f} ({100 * width:.2g} %)" if width < 10.0 else f"{share:.3f}"
 
 
 def write_page(hits, cases):
