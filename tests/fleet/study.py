@@ -35,8 +35,9 @@ One fleet of simulated dyno runs of {DAMPERS} dampers on {BENCHES} benches ({sec
 machine, one of which is killed after a third of the runs, and through {CORES} processes. Throughput
 is held against plain loops over single diagnoses, one on each of {CORES} cores at once, over
 {singles} of the runs. The cost of distributing is the CPU time of this program, and of Dask's
-scheduler. The runs are short: with longer ones distributing costs a smaller share. Times are of a
-shared machine.
+scheduler. The runs are short: with longer ones distributing costs a smaller share. What a campaign
+costs once is spread over its runs, so that few runs have a larger cost each. Times are of a machine
+with other work.
 """
 
 
