@@ -46,11 +46,11 @@ MOST_ERROR = 0.02
 
 TEXT = """
 Bridge and simulated bench are in one process, on a virtual bus, in real time: one frame in and one
-frame out a tick, at {rate_hz:g} Hz for {seconds:g} s. {load} SCHED_FIFO was requested and
-{granted}. Lateness is the time from a tick's deadline to the wake-up of the loop, work the time
-from there to the end of the tick. A missed tick is skipped and counted. The force error is the RMS
-difference to the simulated bench's load cell, over its peak. Lateness is the machine's as much as
-the program's: another one gives other figures, and no bus hardware is in these.
+frame out a tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
+Lateness is the time from a tick's deadline to the wake-up of the loop, work the time from there to
+the end of the tick. A missed tick is skipped and counted. The force error is the RMS difference to
+the simulated bench's load cell, over its peak. Lateness is the machine's as much as the program's:
+another one gives other figures, and no bus hardware is in these.
 """
 
 _ROUND_NS = 20_000_000
@@ -158,7 +158,7 @@ def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error:
             rate_hz=rate_hz,
             seconds=seconds,
             load=load,
-            granted="granted" if granted else "not granted",
+            granted="under" if granted else "without",
         ),
         [
             table(("time of a tick", *levels), rows),
