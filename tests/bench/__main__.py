@@ -87,7 +87,7 @@ def main() -> None:
             compare(time_rounds(tick_subjects())),
             "With an observer, and nothing else:",
             compare(time_rounds(observer_subjects())),
-            "The struts of a full car beside one, without the cost of their model:",
+            "Four struts of a full car compared with one, without the cost of their model:",
             compare_struts(Path(folder)),
             describe_logs(Path(folder)),
         ]
