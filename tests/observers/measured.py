@@ -113,7 +113,7 @@ def compare(name, record, force_n=None):
         name,
         "the smoothed force" if force_n is None else "the load cell",
         f"{1e6 * noise_std_m:.2g}",
-        f"{deviation:.3g}",
+        f"{deviation:.4g}",
         *(_cell(errors.get(kind), valid.get(kind, 1.0)) for kind in KINDS),
     )
 
