@@ -11,7 +11,7 @@ from tests import evidence
 PAGES = sorted(evidence.FOLDER.glob("*.md"))
 ORIGIN = re.compile(
     r"\n\nMeasured with\n\n    (?P<command>.+)\n\n"
-    r"on \d{4}-\d\d-\d\d, rig \S+ \(commit \w+\), Python [^\n]+ cores\.\n\Z"
+    r"on \d{4}-\d\d-\d\d, rig \S+ \(commit \w+\), Python [^\n]+ cores[^\n]*\.\n\Z"
 )
 
 
