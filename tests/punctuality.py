@@ -22,7 +22,7 @@ from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
 The bridge and a loop that does nothing run in turn at 1 kHz, for the same time each, with the
-simulated bench in the bridge's process and a process on each core that is busy for {busy:.0%} of
+simulated bench in the bridge's process and a process on each core that is busy for {busy:g} % of
 the time. A tick is missed when the loop is late by its whole period. Only the two runs of one pair
 can be compared: hours differ more than programs do. The causes are those that `rig timing` computes
 from the kernel's accounting. SCHED_FIFO was {granted}.
@@ -117,7 +117,7 @@ def main() -> None:
         for cause, count in total.most_common():
             print(f"  {count:6}  {cause}")
     if asked.page:
-        text = TEXT.format(busy=asked.busy, granted=_granted(asked.out / "bridge000" / "run"))
+        text = TEXT.format(busy=100 * asked.busy, granted=_granted(asked.out / "bridge000" / "run"))
         write_page(rows, text, asked.seconds)
 
 

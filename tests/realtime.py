@@ -146,7 +146,7 @@ def show(ended: Ended, rate_hz: float, error: float) -> None:
 def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error: float) -> None:
     """Write the guide's page."""
     granted = ended.granted is not None and ended.granted.fifo
-    load = f"A process on each core is busy for {busy:.0%} of the time." if busy else ""
+    load = f"A process on each core is busy for {100 * busy:g} % of the time." if busy else ""
     missed = ended.state.counts.overruns
     times = {"lateness": ended.timing.lateness_us(), "work": ended.timing.work_us()}
     rows = [(name, *(f"{value:.0f}" for value in found.values())) for name, found in times.items()]
@@ -162,8 +162,8 @@ def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error:
         ),
         [
             table(("time of a tick", *levels), rows),
-            f"Of {ended.ticks + missed} ticks {missed} were missed. The force error is {error:.2%} "
-            "of the peak (RMS).",
+            f"Of {ended.ticks + missed} ticks {missed} were missed. The force error is "
+            f"{100 * error:.2f} % of the peak (RMS).",
         ],
         command_line(),
     )
