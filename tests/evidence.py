@@ -4,9 +4,11 @@ A page is one file under `rig/guide/pages/evidence`. Its command, date, version 
 it, so that a reader can repeat it, and nobody has to believe a figure that was typed.
 """
 
+import argparse
 import datetime
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -16,6 +18,22 @@ from rig.guide.site import PAGES
 from rig.machine.installed_versions import version_of
 
 FOLDER = PAGES / "evidence"
+
+
+PAGE_HELP = "write the guide's page of evidence"
+"""Help of the option `--page`, by which a program writes its page."""
+
+
+def add_page_option(parser: argparse.ArgumentParser) -> None:
+    """Give a program the option `--page`."""
+    parser.add_argument("--page", action="store_true", help=PAGE_HELP)
+
+
+def command_line() -> str:
+    """The command that started this program, as a shell takes it."""
+    spec = sys.modules["__main__"].__spec__
+    module = spec.name.removesuffix(".__main__") if spec else sys.argv[0]
+    return shlex.join(["python", "-m", module, *sys.argv[1:]])
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -35,6 +53,7 @@ def write_evidence(name: str, title: str, text: str, tables: Sequence[str], comm
         command: What measured them.
     """
     path = FOLDER / f"{name}.md"
+    path.parent.mkdir(exist_ok=True)
     parts = [f"# {title}", text.strip(), *tables, f"Measured with\n\n    {command}\n\n{_origin()}"]
     path.write_text("\n\n".join(parts) + "\n", "utf-8")
     return path
@@ -50,5 +69,5 @@ def _origin() -> str:
     return (
         f"on {today}, rig {version_of('rig')} (commit {commit or 'unknown'}), Python "
         f"{'.'.join(map(str, sys.version_info[:3]))}, {packages}, {platform.system()} on "
-        f"{os.cpu_count()} cores."
+        f"{os.cpu_count()} cores, load average {os.getloadavg()[2]:.1f} over a quarter of an hour."
     )

@@ -14,9 +14,21 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.log.reader import read_run
 from rig.plan.load import plan_of_run
 from rig.run.late_ticks import find_late_ticks
 from rig.run.trace import read_trace
+from tests.evidence import add_page_option, command_line, table, write_evidence
+
+TEXT = """
+The bridge and a loop that does nothing run in turn at 1 kHz, for the same time each, with the
+simulated bench in the bridge's process and a process on each core that is busy for {busy:g} % of
+the time. A tick is missed when the loop is late by its whole period. Only the two runs of one pair
+can be compared: hours differ more than programs do. The causes are those that `rig timing` computes
+from the kernel's accounting. SCHED_FIFO was {granted}.
+"""
+
+NAMES = {"bare": "empty loop", "bridge": "bridge"}
 
 
 def missed(folder: Path, seconds: float, *, bare: bool, busy: float) -> tuple[int, Counter[str]]:
@@ -37,6 +49,39 @@ def _period_ns(folder: Path) -> int:
     return plan_of_run(folder).period_ns
 
 
+def _granted(folder: Path) -> str:
+    header = read_run(folder).header
+    return "granted" if header["granted"]["fifo"] else "not granted"
+
+
+def write_page(rows: list[dict[str, tuple[int, Counter[str]]]], text: str, seconds: float) -> None:
+    """Write the guide's page: the spread over the pairs, and what took the ticks."""
+    counts = np.array([[row[name][0] for name in NAMES] for row in rows])
+    causes = {name: sum((row[name][1] for row in rows), Counter[str]()) for name in NAMES}
+    low, middle, high = np.percentile(counts, [10, 50, 90], axis=0)
+    spread = [f"{m:g} ({a:g} to {b:g})" for a, m, b in zip(low, middle, high, strict=True)]
+    total = causes["bare"] + causes["bridge"]
+    cells = [
+        ("median (10 to 90 %)", *spread),
+        (f"in all {len(rows)}", *counts.sum(axis=0)),
+        *(
+            (f"- {cause}", *(causes[name][cause] for name in NAMES))
+            for cause, _ in total.most_common()
+        ),
+    ]
+    difference = f"{np.median(np.diff(counts)):g}"
+    write_evidence(
+        "punctuality",
+        "Is the bridge as punctual as an empty loop?",
+        text,
+        [
+            table((f"missed ticks of {seconds * 1000:g}", *NAMES.values()), cells),
+            f"Bridge less empty loop, median of the pairs: {difference} ticks.",
+        ],
+        command_line(),
+    )
+
+
 def main() -> None:
     """Run the pairs and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -44,32 +89,36 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=40)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--busy", type=float, default=1.0, help="share of each core kept busy")
+    add_page_option(parser)
     asked = parser.parse_args()
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, tuple[int, Counter[str]]]] = []
     for pair in range(asked.pairs):
         found = {
             name: missed(
                 asked.out / f"{name}{pair:03d}", asked.seconds, bare=name == "bare", busy=asked.busy
             )
-            for name in ("bare", "bridge")
+            for name in NAMES
         }
-        rows.append({name: [count, dict(causes)] for name, (count, causes) in found.items()})
+        rows.append(found)
         print(
             f"pair {pair}: empty loop {found['bare'][0]}, bridge {found['bridge'][0]}", flush=True
         )
         (asked.out / "pairs.json").write_text(json.dumps(rows, indent=1))
-    counts = np.array([[row[name][0] for name in ("bare", "bridge")] for row in rows])
-    for name, column in zip(("empty loop", "bridge"), counts.T, strict=True):
+    counts = np.array([[row[name][0] for name in NAMES] for row in rows])
+    for name, column in zip(NAMES.values(), counts.T, strict=True):
         low, middle, high = np.percentile(column, [10, 50, 90])
         print(f"{name}: median {middle:g} (10 to 90 %: {low:g} to {high:g}), sum {column.sum()}")
     print(f"bridge less empty loop, median of the pairs: {np.median(np.diff(counts)):g}")
-    for name in ("bare", "bridge"):
+    for name in NAMES:
         total = Counter[str]()
         for row in rows:
             total.update(row[name][1])
         print(f"{name}:")
         for cause, count in total.most_common():
             print(f"  {count:6}  {cause}")
+    if asked.page:
+        text = TEXT.format(busy=100 * asked.busy, granted=_granted(asked.out / "bridge000" / "run"))
+        write_page(rows, text, asked.seconds)
 
 
 if __name__ == "__main__":

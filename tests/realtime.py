@@ -33,6 +33,7 @@ from rig.run.timing import Timing
 from rig.run.trace import Trace
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig
+from tests.evidence import add_page_option, command_line, table, write_evidence
 from tests.soak import force_error_n, load_cell
 
 ESTIMATE = SignalName(message="RIG_ESTIMATE", signal="SPRING_DAMPER_FORCE")
@@ -42,6 +43,15 @@ CLASSIC_CAN_HZ = 3703
 """What 1 Mbit/s carries of one frame in and one out, with the most stuff bits."""
 
 MOST_ERROR = 0.02
+
+TEXT = """
+Bridge and simulated bench are in one process, on a virtual bus, in real time: one frame in and one
+frame out a tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
+Lateness is the time from a tick's deadline to the wake-up of the loop, work the time from there to
+the end of the tick. A missed tick is skipped and counted. The force error is the RMS difference to
+the simulated bench's load cell, over its peak. Lateness is the machine's as much as the program's:
+another one gives other figures, and no bus hardware is in these.
+"""
 
 _ROUND_NS = 20_000_000
 """In which a busy process works for its share, and then rests."""
@@ -133,6 +143,32 @@ def show(ended: Ended, rate_hz: float, error: float) -> None:
     print(draw_run(ended))
 
 
+def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error: float) -> None:
+    """Write the guide's page."""
+    granted = ended.granted is not None and ended.granted.fifo
+    load = f"A process on each core is busy for {100 * busy:g} % of the time." if busy else ""
+    missed = ended.state.counts.overruns
+    times = {"lateness": ended.timing.lateness_us(), "work": ended.timing.work_us()}
+    rows = [(name, *(f"{value:.0f}" for value in found.values())) for name, found in times.items()]
+    levels = [f"{level.replace('_', '.')}, µs" for level in times["lateness"]]
+    write_evidence(
+        "real-time",
+        "In real time",
+        TEXT.format(
+            rate_hz=rate_hz,
+            seconds=seconds,
+            load=load,
+            granted="under" if granted else "without",
+        ),
+        [
+            table(("time of a tick", *levels), rows),
+            f"Of {ended.ticks + missed} ticks {missed} were missed. The force error is "
+            f"{100 * error:.2f} % of the peak (RMS).",
+        ],
+        command_line(),
+    )
+
+
 def _share(text: str) -> float:
     share = float(text)
     if not 0.0 <= share <= 1.0:
@@ -155,7 +191,10 @@ def main() -> int:
     )
     parser.add_argument("--trace", action="store_true", help="keep what became of late ticks")
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
+    add_page_option(parser)
     asked = parser.parse_args()
+    if asked.page and asked.bare:
+        parser.error("--page: the page is about the bridge, expected no --bare")
     ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
     load = busy_cores(asked.busy) if asked.busy > 0.0 else contextlib.nullcontext()
     if asked.bare:
@@ -174,6 +213,8 @@ def main() -> int:
     peak_n = float(np.abs(load_cell(ended.folder, 0)[1]).max())
     error = force_error_n(ended.folder, 0) / peak_n
     show(ended, asked.rate_hz, error)
+    if asked.page:
+        write_page(ended, asked.rate_hz, asked.seconds, asked.busy, error)
     missed = ended.granted is not None and ended.granted.fifo and ended.state.counts.overruns > 0
     return 1 if missed or error > MOST_ERROR else 0
 

@@ -182,12 +182,18 @@ def ticks_of(bridge: Bridge, folder: Path, count: int) -> Subject:
     return ticks
 
 
-def test_four_observers_in_a_full_car_against_one(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(build, "ENGINES", MappingProxyType({"standing": StandStill}))
+STANDING = MappingProxyType({"standing": StandStill})
+"""To be put in the place of `build.ENGINES`."""
+
+OBSERVERS = {"PI": PI, "noise-aware": KALMAN}
+
+
+def strut_subjects(folder: Path) -> dict[str, Subject]:
+    """Ticks of one strut alone and of four in a full car, with each observer."""
     suspensions = [f"suspension_{name}" for name in FullCar.corners]
     subjects: dict[str, Subject] = {}
-    for kind, observer in (("PI", PI), ("noise-aware", KALMAN)):
-        alone, car = tmp_path / f"{kind}_one", tmp_path / f"{kind}_four"
+    for kind, observer in OBSERVERS.items():
+        alone, car = folder / f"{kind}_one", folder / f"{kind}_four"
         alone.mkdir()
         car.mkdir()
         (alone / "alone.yaml").write_text(ALONE)
@@ -196,8 +202,13 @@ def test_four_observers_in_a_full_car_against_one(tmp_path, capsys, monkeypatch)
         four = bridge_of(car, "full_car.yaml", suspensions, observer)
         subjects[f"{kind}, one strut"] = ticks_of(one, alone, 1)
         subjects[f"{kind}, four struts"] = ticks_of(four, car, 4)
-    found = compare_rounds(subjects, capsys)
-    for kind in ("PI", "noise-aware"):
+    return subjects
+
+
+def test_four_observers_in_a_full_car_against_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(build, "ENGINES", STANDING)
+    found = compare_rounds(strut_subjects(tmp_path), capsys)
+    for kind in OBSERVERS:
         ratio = np.median(found[f"{kind}, four struts"] / found[f"{kind}, one strut"])
         with capsys.disabled():
             print(f"{kind}: four cost {ratio:.2f} times one")

@@ -55,27 +55,38 @@ pytestmark = pytest.mark.long
 Subject = Callable[[], None]
 
 
-def compare_rounds(
-    subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]
-) -> dict[str, np.ndarray]:
-    """Time of one tick of each subject in each round, µs; prints the ratios to the first."""
+def time_rounds(subjects: dict[str, Subject]) -> dict[str, np.ndarray]:
+    """Time of one tick of each subject in each round, µs."""
     times: dict[str, list[float]] = {name: [] for name in subjects}
     for _ in range(ROUNDS):
         for name, subject in subjects.items():
             start = process_time_ns()
             subject()
             times[name].append((process_time_ns() - start) / TICKS / 1000)
-    first = next(iter(times))
+    return {name: np.array(found) for name, found in times.items()}
+
+
+def ratios(found: dict[str, np.ndarray], first: str) -> dict[str, tuple[float, float, float]]:
+    """Time of each subject over that of one of them: 10 %, median and 90 % of the rounds."""
+    return {
+        name: tuple(np.percentile(times / found[first], [10, 50, 90]))
+        for name, times in found.items()
+    }
+
+
+def compare_rounds(
+    subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]
+) -> dict[str, np.ndarray]:
+    """Time of one tick of each subject in each round, µs; prints the ratios to the first."""
+    found = time_rounds(subjects)
     with capsys.disabled():
         print()
-        for name, found in times.items():
-            ratios = np.percentile(np.array(found) / np.array(times[first]), [10, 50, 90])
-            low, middle, high = ratios
+        for name, (low, middle, high) in ratios(found, next(iter(found))).items():
             print(
-                f"{name:42} {np.median(found):7.2f} us,"
+                f"{name:42} {np.median(found[name]):7.2f} us,"
                 f" {middle:5.2f} times ({low:.2f} to {high:.2f})"
             )
-    return {name: np.array(found) for name, found in times.items()}
+    return found
 
 
 def dart_world() -> tuple[dartpy.simulation.World, dartpy.dynamics.Skeleton]:
@@ -219,7 +230,8 @@ def core_steps(model: str, heights: tuple[float, ...], *, observing: bool) -> Su
     return steps(rig, begun[-1], inputs)
 
 
-def test_a_whole_tick_against_the_bare_dart_loop(capsys):
+def tick_subjects() -> dict[str, Subject]:
+    """DART alone, and a tick with more and more of what belongs to it."""
     plant = DartPlant(load_model(MODELS / "reference.yaml"))
     state = plant.init([0.4])
     loaded = plant.load(state, (0.0,), 10.0, 20.0)
@@ -229,33 +241,36 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
             plant.step(loaded, 1e-3, 11.0)
             plant.load(state, (0.0,), 10.0, 20.0)
 
-    found = compare_rounds(
-        {
-            "DART, array functions": array_loop(observing=False),
-            "DART, scalar functions": scalar_loop(observing=False),
-            "third-order plant": plant_ticks,
-            "core step": core_steps("reference", (0.4,), observing=True),
-            "whole tick, frame in and frame out": whole_ticks(),
-            "cantools, DART and a PI by hand": hand_written_loop(),
-        },
-        capsys,
-    )
+    return {
+        "DART, array functions": array_loop(observing=False),
+        "DART, scalar functions": scalar_loop(observing=False),
+        "third-order plant": plant_ticks,
+        "core step": core_steps("reference", (0.4,), observing=True),
+        "whole tick, frame in and frame out": whole_ticks(),
+        "cantools, DART and a PI by hand": hand_written_loop(),
+    }
+
+
+def test_a_whole_tick_against_the_bare_dart_loop(capsys):
+    found = compare_rounds(tick_subjects(), capsys)
     tick = found["whole tick, frame in and frame out"]
     assert np.median(tick / found["cantools, DART and a PI by hand"]) <= 2.6  # measured: 1.9 to 2.0
 
 
+def observer_subjects() -> dict[str, Subject]:
+    """DART alone, and with an observer."""
+    return {
+        "DART, array functions": array_loop(observing=False),
+        "the same with an observer": array_loop(observing=True),
+        "DART, scalar functions": scalar_loop(observing=False),
+        "these with an observer": scalar_loop(observing=True),
+        "cantools, DART and a PI by hand": hand_written_loop(),
+    }
+
+
 def test_an_observer_adds_a_fraction_of_the_loop_by_hand(capsys):
     """Against DART alone its share was 1.19 on one machine and 1.36 on another."""
-    found = compare_rounds(
-        {
-            "DART, array functions": array_loop(observing=False),
-            "the same with an observer": array_loop(observing=True),
-            "DART, scalar functions": scalar_loop(observing=False),
-            "these with an observer": scalar_loop(observing=True),
-            "cantools, DART and a PI by hand": hand_written_loop(),
-        },
-        capsys,
-    )
+    found = compare_rounds(observer_subjects(), capsys)
     by_hand = found["cantools, DART and a PI by hand"]
     arrays = found["the same with an observer"] - found["DART, array functions"]
     scalars = found["these with an observer"] - found["DART, scalar functions"]
@@ -305,10 +320,11 @@ def test_a_tick_over_a_virtual_bus(capsys):
         print(f"\ntick over virtual: p50 {p50:.0f}, p99 {p99:.0f}, p99.9 {p999:.0f} us of work")
 
 
-def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
+def time_replays(folder: Path) -> tuple[float, float]:
+    """Time of a tick of a replay and of the loop by hand, µs; the fastest of five rounds each."""
     ticks = 20_000
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, ticks, {})))
+    live(ready, folder / "run", ListPort(bench_frames(ready, ticks, {})))
     by_hand, per_tick_us = hand_written_loop(), []
     by_hand_us: list[float] = []
     for _ in range(5):
@@ -318,10 +334,16 @@ def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
             by_hand()
         by_hand_us.append((process_time_ns() - start) / (rounds * TICKS) / 1000)
         start = process_time_ns()
-        found = replay(tmp_path / "run")
+        found = replay(folder / "run")
         per_tick_us.append((process_time_ns() - start) / ticks / 1000)
         assert found.different == 0
+    return min(per_tick_us), min(by_hand_us)
+
+
+def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
+    replay_us, by_hand_us = time_replays(tmp_path)
     with capsys.disabled():
-        rate = 1e6 / min(per_tick_us)
-        print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
-    assert min(per_tick_us) / min(by_hand_us) <= 3.1  # measured: 2.2 to 2.4
+        print(
+            f"\nreplay: {replay_us:.1f} us a tick, {1e6 / replay_us:.0f} ticks a second of a core"
+        )
+    assert replay_us / by_hand_us <= 3.1  # measured: 2.2 to 2.4

@@ -20,7 +20,8 @@ from tests.diagnosis_benchmark.bounds import violations
 from tests.diagnosis_benchmark.execute import crashed, execute
 from tests.diagnosis_benchmark.judge import Result
 from tests.diagnosis_benchmark.plan import GROUPS, Counts, Slot, part_of, slots
-from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
+from tests.diagnosis_benchmark.summary import print_tables, summarise, write_page, write_tables
+from tests.evidence import add_page_option
 from tests.truth.cases import make_case
 from tests.truth.files import write_case
 
@@ -45,6 +46,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder for results and tables")
     parser.add_argument("--limit-s", type=float, default=600.0, help="longest time for a case")
     parser.add_argument("--write", nargs=2, metavar=("KIND", "SEED"), help="only write one case")
+    add_page_option(parser)
     args = parser.parse_args()
     unknown = set(_chosen(args)) - set(GROUPS)
     if unknown:
@@ -96,6 +98,8 @@ def main() -> int:
     write_tables(results, summary, args.out)
     console = Console(width=200)
     print_tables(summary, console)
+    if args.page:
+        write_page(summary)
     violated = violations(summary)
     for line in violated:
         console.print(f"bound violated: {line}", markup=False)

@@ -14,6 +14,8 @@ from rich.table import Table
 
 from tests.diagnosis_benchmark.judge import Result
 from tests.diagnosis_benchmark.plan import GROUPS
+from tests.evidence import command_line, write_evidence
+from tests.evidence import table as markdown_table
 from tests.truth.cases import FAMILIES
 
 FIRST_COLUMNS = (*FAMILIES, "restoring_surface", "none")
@@ -31,6 +33,20 @@ POOLS = {
 }
 """Groups that are also counted together. A force outside any catalogue has no right name, so what
 is named there is counted apart."""
+
+
+TEXT = f"""
+Recordings are simulated on benches whose truth is known, by a generator with its own equations of
+motion. Each case plants no effect, one, or several, on a bench or a dyno, with an exact or a rough
+nominal model; formulas that the catalogue does not hold are among them. A case is right where `rig
+diagnose` names the planted families as missing (a single one first), where a partial or ambiguous
+result contains them, or where nothing is planted and at most linear corrections of a rough model
+are named. Of a force that no law describes, a result is right that claims neither that laws explain
+it nor that nothing is missing. The held-out error of an `explained` case is held against
+{EXPLAINED_MULTIPLE} times that of a right model (on a dyno, against the noise floor that the
+diagnosis reports). Shares have their 95 % interval after Wilson. The rows in italics count several
+groups together.
+"""
 
 
 class Rate(NamedTuple):
@@ -195,6 +211,32 @@ def markdown(summary: dict) -> str:
     heading = ["group", *(column.heading for column in COLUMNS)]
     lines = [heading, ["---", *("---:" for _ in COLUMNS)], *_rows(summary)]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _wrong_rows(summary: dict) -> list[tuple[str, ...]]:
+    return [
+        (
+            f"{entry['slot']} ({entry['case']})",
+            entry["verdict"],
+            ", ".join([*entry["families"], *entry["linear"]]) or "nothing",
+            ", ".join(entry["ambiguous_with"]),
+            entry["message"],
+        )
+        for entry in summary["wrong"]
+    ]
+
+
+def write_page(summary: dict) -> None:
+    """Write the guide's page: the table of groups, and which cases were wrong."""
+    rows = _wrong_rows(summary)
+    wrong = markdown_table(("wrong case", "verdict", "named", "ambiguous with", "message"), rows)
+    write_evidence(
+        "diagnosis",
+        "How often a diagnosis is right",
+        TEXT,
+        [markdown(summary).strip(), wrong if rows else "No case was wrong."],
+        command_line(),
+    )
 
 
 def print_tables(summary: dict, console: Console) -> None:

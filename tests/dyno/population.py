@@ -18,6 +18,7 @@ import numpy as np
 from rig.dyno.characterise import ForceRecord, characterise_record
 from rig.dyno.faults import name_faults
 from rig.dyno.master import master_of
+from tests.evidence import add_page_option, command_line, table, write_evidence
 
 RATE_HZ, AMPLITUDE_M, MIDDLE_M = 250.0, 0.025, 0.35
 STEPS = ((0.004, 2.6), (0.05, 6.0), (0.1, 6.0), (0.2, 6.0), (0.4, 8.0), (0.8, 10.0))
@@ -190,6 +191,27 @@ def one(job):
     return fault, [item.name for item in naming.named], naming, damper
 
 
+TEXT = """
+`rig characterise --master` names what is wrong with a damper, compared with a good one of the same
+test. Here the dampers are simulated, by equations of their own: a polytropic gas column, a law of
+damping with a sharp knee, oil whose stiffness rises with pressure, play as a contact. Gas force,
+friction, damping below and above the knee and the knee's speed, in each direction, scatter by
+{scatter:g} % (standard deviation) from damper to damper, and the master is one without scatter.
+Half of the dampers are good, the others have one fault each, of a random size. A fault that is not
+in this list is not part of the test.
+"""
+
+PLANTED = {
+    "good": "nothing",
+    "gas pressure": "gas pressure, 20 to 80 % of it lost",
+    "seal friction": "seal friction, 15 to 80 N more",
+    "air in the oil": "air in the oil, 0.2 to 1 mm/kN at low pressure",
+    "play": "play, 0.2 to 1 mm",
+    "another damping": "damping, 20 to 50 % less at all speeds in one direction or both",
+    "blow-off early": "blow-off at a speed 25 to 60 % lower, in one direction or both",
+}
+"""What `FAULTS` draws."""
+
 MASTER = None
 
 
@@ -249,14 +271,40 @@ def study(dampers: int, seed: int, processes: int) -> Mapping[str, Counter[str]]
     return found
 
 
+def row_of(fault: str, counts: Counter[str]) -> tuple[object, ...]:
+    """A row of the page."""
+    named = {name: count for name, count in counts.items() if name != "(size held)"}
+    right, number = named.pop(fault, 0), sum(named.values())
+    others = ", ".join(f"{count} {name}" for name, count in sorted(named.items()))
+    has_size = bool(true_sizes(fault, FAULTS[fault](Damper(), np.random.default_rng(0))))
+    held = f"{counts['(size held)']} of {right}" if has_size else ""
+    return PLANTED[fault], right + number, right, others, held
+
+
+def write_page(found: Mapping[str, Counter[str]]) -> None:
+    """Write the guide's page."""
+    heads = ("planted", "dampers", "named right", "named otherwise", "interval holds the size")
+    write_evidence(
+        "dyno-faults",
+        "Faults of a damper",
+        TEXT.format(scatter=100 * SCATTER),
+        [table(heads, [row_of(*item) for item in found.items()])],
+        command_line(),
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--dampers", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=2)
+    add_page_option(parser)
     given = parser.parse_args()
-    for fault, counts in study(given.dampers, given.seed, given.processes).items():
+    found = study(given.dampers, given.seed, given.processes)
+    for fault, counts in found.items():
         print(f"{fault:16} {dict(counts.most_common())}")
+    if given.page:
+        write_page(found)
 
 
 if __name__ == "__main__":

@@ -200,7 +200,7 @@ def test_a_payload_of_another_length(row):
     assert ticks[-1].counts.wrong_length == END_MS - BEGIN_MS
     row(
         34,
-        "frames of another length (a PDO that somebody mapped anew)",
+        "frames of another length (a PDO that was mapped again)",
         "refuses and counts each (`wrong_length`); estimate invalid (HOLD), then the safe state",
         found_ms,
         "the frames",

@@ -12,6 +12,7 @@ import pytest
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
+ALONE = "where there is no watchdog, notice that the frames stop"
 SIGNALS = ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGHUP", "SIGINT")
 
 
@@ -47,11 +48,21 @@ def test_the_last_that_the_bus_receives_is_invalid(ends, name):
     assert end["invalid_frames"] >= 3
 
 
-def test_how_soon(ends):
+def test_how_soon(ends, promise):
     """In order at the next tick; killed, within a second; a standstill after `safe_after_s`."""
     assert all(ends[name]["first_invalid_s"] < 0.2 for name in ("SIGTERM", "SIGHUP", "SIGINT"))
     assert ends["SIGKILL"]["first_invalid_s"] < 0.5
     assert 0.45 < ends["SIGSTOP"]["first_invalid_s"] < 1.0
+    in_order_s = max(ends[name]["first_invalid_s"] for name in ("SIGTERM", "SIGHUP", "SIGINT"))
+    for order, (words, within_s, duty) in enumerate(
+        (
+            ("Ctrl-C, SIGTERM, a closed terminal", in_order_s, "nothing"),
+            ("SIGKILL of the bridge, with its watchdog", ends["SIGKILL"]["first_invalid_s"], ALONE),
+            ("SIGSTOP of the bridge, with its watchdog", ends["SIGSTOP"]["first_invalid_s"], ALONE),
+        ),
+        start=70,
+    ):
+        promise(order, words, [], f"after {1e3 * within_s:.0f} ms", "", {}, duty)
 
 
 def test_the_exit_codes(ends):

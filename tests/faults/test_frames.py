@@ -64,7 +64,7 @@ def test_loss(row, undisturbed_n):
     row(
         1,
         "loss: 10 % of the measurements",
-        f"goes on, counts every one ({ticks[-1].counts.lost}); force error {error_n:.1f} N "
+        f"continues, counts every one ({ticks[-1].counts.lost}); force error {error_n:.1f} N "
         f"instead of {undisturbed_n:.1f} N RMS",
         first_ms(ticks, lambda tick: tick.counts.lost > 0),
         NOTHING_RECEIVED,

@@ -178,8 +178,8 @@ def test_clock_jump(row, step_s):
         row(
             19,
             "clock jump: the system's clock set by an hour, forwards and backwards",
-            "nothing: the run's clock is monotonic, and the frames' stamps are taken anew from it; "
-            "counted in `run.yaml`",
+            "nothing: the run's clock is monotonic, and the frames' stamps are taken again from "
+            "it; counted in `run.yaml`",
             "0 ms",
             "nothing",
         )
@@ -218,7 +218,7 @@ def test_disk_full(row, tmp_path):
     row(
         15,
         "disk full in the middle of a run",
-        "goes on, LOG_FAULT; what was written stays whole and replays; ticks wait in memory (two "
+        "continues, LOG_FAULT; what was written stays whole and replays; ticks wait in memory (two "
         "minutes at 1 kHz) and are written when there is space again",
         "1 ms",
         "what was not written when the run ended; its number stands in `run.yaml`",

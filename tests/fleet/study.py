@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 
@@ -21,12 +22,23 @@ from rig.fleet.campaign import CampaignProgress, FleetModel, load_fleet_model, r
 from rig.fleet.executors import Engine, dask, processes
 from rig.fleet.one_run import evaluate_run
 from rig.fleet.sources import RunSource, find_sources
+from tests.evidence import add_page_option, command_line, table, write_evidence
 from tests.fleet.cluster import cluster
-from tests.fleet.population import Piece, write_fleet, write_model
+from tests.fleet.population import RATE_HZ, SAMPLES, Piece, write_fleet, write_model
 
 CORES, WORKERS, SINGLE = 2, 4, 200
 BENCHES, DAMPERS = 4, 40
 PATTERN = "{bench}/{date}/{damper}"
+TEXT = """
+One fleet of simulated dyno runs of {DAMPERS} dampers on {BENCHES} benches ({seconds:g} s at
+{RATE_HZ:g} Hz each) is diagnosed twice: through a Dask cluster of {WORKERS} workers on this
+machine, one of which is killed after a third of the runs, and through {CORES} processes. Throughput
+is held against plain loops over single diagnoses, one on each of {CORES} cores at once, over
+{singles} of the runs. The cost of distributing is the CPU time of this program, and of Dask's
+scheduler. The runs are short: with longer ones distributing costs a smaller share. What a campaign
+costs once is spread over its runs, so that few runs have a larger cost each. Times are of a machine
+with other work.
+"""
 
 
 def scattered(_damper, _week, rng):
@@ -84,11 +96,67 @@ def content(out: Path) -> list[str]:
     return list(map(repr, [*runs, *store.query(out, values)[1]]))
 
 
+class Measured(NamedTuple):
+    """One campaign.
+
+    Attributes:
+        name: Of the engine.
+        done: Runs.
+        failed: Runs that failed.
+        elapsed_s: Its duration.
+        rate: Runs a second and core.
+        share: That rate over the one of plain loops.
+        own_ms: CPU time of this process a run.
+        scheduler_ms: CPU time of the scheduler a run.
+    """
+
+    name: str
+    done: int
+    failed: int
+    elapsed_s: float
+    rate: float
+    share: float
+    own_ms: float
+    scheduler_ms: float
+
+    @property
+    def hours_of_a_million(self) -> float:
+        """CPU time of distributing a million runs."""
+        return (self.own_ms + self.scheduler_ms) * 1e6 / 3.6e6
+
+
+def write_page(campaigns: Sequence[Measured], alone: float, singles: int, sentences: str) -> None:
+    """Write the guide's page."""
+    heads = ("through", "runs", "failed", "s", "runs a second and core", "of plain loops")
+    costs = ("ms a run here", "ms a run in the scheduler", "h of CPU for a million runs")
+    rows = [
+        (
+            item.name,
+            item.done,
+            item.failed,
+            f"{item.elapsed_s:.0f}",
+            f"{item.rate:.2f}",
+            f"{item.share:.2f}",
+            f"{item.own_ms:.2f}",
+            f"{item.scheduler_ms:.2f}",
+            f"{item.hours_of_a_million:.2f}",
+        )
+        for item in campaigns
+    ]
+    numbers = {"CORES": CORES, "WORKERS": WORKERS, "DAMPERS": DAMPERS, "BENCHES": BENCHES}
+    text = TEXT.format(**numbers, RATE_HZ=RATE_HZ, seconds=SAMPLES / RATE_HZ, singles=singles)
+    loops = f"Plain loops: {alone:.2f} diagnoses a second and core."
+    found = table((*heads, *costs), rows)
+    title = "Many runs at once"
+    write_evidence("fleet", title, text, [loops, found, sentences], command_line())
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    add_page_option(parser)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -108,32 +176,41 @@ def main() -> None:
             with dask(there.address) as engine:
                 end, own_s = through(engine, sources, model, out, victim)
             spent_s = (sum(scheduler.cpu_times()[:2]) - before) / end.done
-            report("Dask", end, alone, own_s, spent_s)
+            campaigns = [report("Dask", end, alone, own_s, spent_s)]
             is_gone = not victim.is_running() or victim.status() == psutil.STATUS_ZOMBIE
             print(f"  the killed worker is gone: {is_gone}", flush=True)
             stores.append(out)
         out = folder / "by_processes"
         end, own_s = through(processes(CORES), sources, model, out, None)
-        report("processes", end, alone, own_s, 0.0)
+        campaigns.append(report("processes", end, alone, own_s, 0.0))
         stores.append(out)
-        first, second = (content(out) for out in stores)
+        is_same = content(stores[0]) == content(stores[1])
         ((runs, keys),) = store.query(out, "SELECT count(*), count(DISTINCT key) FROM runs")[1]
-        print(f"both stores hold the same: {first == second}; {runs} runs, {keys} different")
+        print(f"both stores hold the same: {is_same}; {runs} runs, {keys} different")
+        if given.page:
+            sentences = (
+                f"The worker was {'killed' if is_gone else 'not killed'}. The stores hold "
+                f"{'the same' if is_same else 'different'} runs and values; the second one has "
+                f"{runs} runs with {keys} keys, of {len(sources)} sources."
+            )
+            write_page(campaigns, alone, min(len(sources), CORES * SINGLE), sentences)
 
 
 def report(
     name: str, end: CampaignProgress, alone: float, own_s: float, scheduler_s: float
-) -> None:
-    """A line of the table."""
+) -> Measured:
+    """A line of the table, which is also printed."""
     rate = end.done / end.elapsed_s / CORES
-    shared_ms = 1e3 * (own_s + scheduler_s)
+    costs_ms = 1e3 * own_s, 1e3 * scheduler_s
+    found = Measured(name, end.done, end.failed, end.elapsed_s, rate, rate / alone, *costs_ms)
     print(
         f"{name}: {end.done} runs, {end.failed} failed, {end.elapsed_s:.0f} s, {rate:.2f} a second "
-        f"and core ({rate / alone:.3f} of plain loops); distributing: {1e3 * own_s:.2f} ms a run "
-        f"here and {1e3 * scheduler_s:.2f} ms in the scheduler, {shared_ms * 1e6 / 3.6e6:.2f} h of "
-        "a million runs",
+        f"and core ({found.share:.3f} of plain loops); distributing: {found.own_ms:.2f} ms a run "
+        f"here and {found.scheduler_ms:.2f} ms in the scheduler, {found.hours_of_a_million:.2f} h "
+        "of a million runs",
         flush=True,
     )
+    return found
 
 
 if __name__ == "__main__":

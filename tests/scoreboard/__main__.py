@@ -8,7 +8,17 @@ import typer
 
 from rig.cli.progress import progress_bar
 from rig.cli.terminal import JsonFlag, console, print_json, table
+from tests.evidence import PAGE_HELP, command_line, write_evidence
 from tests.scoreboard.run import run_scoreboard
+from tests.scoreboard.table import page
+
+TEXT = """
+Sets that others measured and published are diagnosed with `rig diagnose`, from a rough start or
+from the published parameters. Laws and parameters are found on the part that is learnt from; the
+tests take no part in search and fit, and can only withdraw laws. Each table has one set: a line a
+model, a column a test. Models named `rig` are computed here, the others are published figures from
+the source in the last column.
+"""
 
 
 def scoreboard(
@@ -25,11 +35,15 @@ def scoreboard(
         list[str] | None,
         typer.Option("--set", metavar="NAME", help="Only this set; may be given several times."),
     ] = None,
+    as_page: Annotated[bool, typer.Option("--page", help=PAGE_HELP)] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Diagnose published measured sets and print our figures beside the published ones."""
     with progress_bar() as bar:
         rows = run_scoreboard(data, out, bar, only or ())
+    if as_page:
+        title = "Measured benches"
+        write_evidence("measured-benches", title, TEXT, [page(rows).strip()], command_line())
     if as_json:
         print_json([asdict(row) for row in rows])
         return
