@@ -38,11 +38,12 @@ is named there is counted apart."""
 TEXT = f"""
 Recordings are simulated on benches whose truth is known, by a generator with its own equations of
 motion. Each case plants no effect, one, or several, on a bench or a dyno, with an exact or a rough
-nominal model; formulas that the catalogue does not hold are among them. A case is right where `rig
-diagnose` names the planted families as missing (a single one first), where a partial or ambiguous
-result contains them, or where nothing is planted and at most linear corrections of a rough model
-are named. Of a force that no law describes, a result is right that claims neither that laws explain
-it nor that nothing is missing. The held-out error of an `explained` case is held against
+nominal model. The whole benchmark also has formulas that the catalogue does not hold, and forces
+that no law describes; the table has the groups that were run. A case is right where `rig diagnose`
+names the planted families as missing (a single one first), where a partial or ambiguous result
+contains them, or where nothing is planted and at most linear corrections of a rough model are
+named. Where no law describes the planted force, a result is right that claims neither that laws
+explain it nor that nothing is missing. The held-out error of an `explained` case is held against
 {EXPLAINED_MULTIPLE} times that of a right model (on a dyno, against the noise floor that the
 diagnosis reports). Shares have their 95 % interval after Wilson. The rows in italics count several
 groups together.
