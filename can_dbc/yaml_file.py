@@ -265,7 +265,7 @@ def _more(others: Sequence[Iterable[int | str]]) -> str:
 def _missing(parts: Sequence[int | str]) -> str:
     if parts and isinstance(parts[-1], int):
         list_key = ".".join(map(str, parts[:-1]))
-        return f"{list_key}: {parts[-1]} items, expected more"
+        return f"{list_key}: {parts[-1]} item(s), expected more"
     return f"{'.'.join(map(str, parts))}: is missing, expected a value"
 
 

@@ -87,7 +87,7 @@ def test_a_run_of_another_layout_is_refused(run, monkeypatch, capsys):
     path = run / "run.yaml"
     path.write_text(path.read_text().replace("schema: 3", "schema: 1"))
     assert rig(monkeypatch, "replay", run) == 2
-    assert "schema: 1: expected 3" in capsys.readouterr().err
+    assert "schema 1: expected 3" in capsys.readouterr().err
 
 
 def test_a_run_without_a_tick_is_no_success(run, monkeypatch, capsys):

@@ -184,7 +184,7 @@ def refused(text: str) -> str:
             "0.mass: unknown key, did you mean mass_kg?",
         ),
         ("prismatic", "sliding", "joint.type: 'sliding': expected one of prismatic, revolute"),
-        ("[0, 0, 1]", "[0, 0]", "joint.axis.2: is missing"),
+        ("[0, 0, 1]", "[0, 0]", "joint.axis: 2 item(s), expected more"),
         ("[0, 0, 1]", "[0, 0, 0]", "joint: axis [0.0, 0.0, 0.0]: expected a direction"),
         ("parent: world", "parent: wall", "joint.parent 'wall': expected world"),
         ("{name: body,", "{name: world,", "body 'world': expected another name"),
@@ -245,7 +245,7 @@ def refused(text: str) -> str:
         (
             "gravity_m_per_s2: 9.81",
             "name: again",
-            "line 3 is no valid YAML: key 'name' stands here",
+            "line 3 is no valid YAML: key 'name' occurs twice",
         ),
         ("gravity_m_per_s2: 9.81", "1: 2", "key 1: expected a name"),
         ("gravity_m_per_s2: 9.81", "a: &x 1\nb: *x", "aliases are not accepted"),
@@ -278,7 +278,7 @@ def test_parents_stand_before_children():
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "reference", "- a\n- b"])
 def test_what_is_no_mapping_is_refused(text):
-    assert "expected keys and values at the top level" in refused(text)
+    assert "expected keys and values" in refused(text)
 
 
 def test_errors_beyond_the_first_are_counted():

@@ -43,11 +43,6 @@ def test_a_page_ends_with_its_command_date_and_version(path):
     assert runs(module_of(found["command"]))
 
 
-def test_the_order_has_every_page():
-    order = (evidence.FOLDER / ".order").read_text("utf-8").split()
-    assert sorted(order) == sorted(path.stem for path in PAGES)
-
-
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_every_row_of_a_table_has_the_cells_of_its_head(path):
     cells = []
