@@ -122,7 +122,9 @@ def _run_one(
         print_run(ended, with_timing=True)
         print_text(f"Run: {folder}")
     _refuse_bad_ends(plan, ended)
-    if not as_json and plan.has_force:
+    if not as_json and listen_only:
+        print_text(f"Next: `rig tune {config} --run {folder} --out tuned.yaml`")
+    elif not as_json and plan.has_force:
         print_text(f"Next: `rig diagnose {folder} --model {folder}/model.yaml --out diagnosis`")
 
 

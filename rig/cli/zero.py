@@ -53,7 +53,8 @@ def zero_command(
     listen_s: ListenSeconds = 2.0,
     run: FromRun = None,
     is_remounted: Annotated[
-        bool, typer.Option("--remounted", help="The sensor was moved since: the zero found before is not used.")
+        bool,
+        typer.Option("--remounted", help="The sensor was moved since its last zero."),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

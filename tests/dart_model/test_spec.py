@@ -229,7 +229,11 @@ def refused(text: str) -> str:
         ("9.81", "9.81\ntolerance: {mass_kg: -1 %}", "tolerance.mass_kg: '-1 %': expected a perc"),
         ("9.81", "9.81\ntolerance: {mass_kg: 2000 %}", "such as 20 %"),
         ("9.81", "9.81\ntolerance: {mass_kg: true}", "tolerance.mass_kg: True: expected a percen"),
-        ("9.81", "9.81\ntolerance: {preload_n: 5 %}", "tolerance.preload_n: '5 %': expected a number alone"),
+        (
+            "9.81",
+            "9.81\ntolerance: {preload_n: 5 %}",
+            "tolerance.preload_n: '5 %': expected a num",
+        ),
         ("9.81", "9.81\ntolerance: {preload_n: 0}", "tolerance.preload_n: 0: expected more than 0"),
         (
             "9.81",

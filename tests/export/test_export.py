@@ -133,7 +133,10 @@ def test_wrong_inputs_are_one_line(run, tmp_path):
     for call, expected in (
         (lambda: export_run(run, "xls", tmp_path / "a"), "expected one of candump, csv"),
         (lambda: export_run(run, "csv", tmp_path / "there"), "expected a new file"),
-        (lambda: export_run(tmp_path / "no", "csv", tmp_path / "a"), "no such folder, expected the folder"),
+        (
+            lambda: export_run(tmp_path / "no", "csv", tmp_path / "a"),
+            "no such folder",
+        ),
         (lambda: import_run(tmp_path / "there", tmp_path / "b"), "is no MF4 file"),
         (lambda: import_run(tmp_path / "folder", tmp_path / "b"), "is no run in Parquet"),
         (lambda: import_run(tmp_path / "folder", run), "expected a new or an empty folder"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from rig.bridge.mode_supervisor import Event
 from rig.cli.main import app
 from rig.guide.reference import generated_blocks
 from rig.guide.site import GENERATED, PAGES
@@ -88,3 +89,8 @@ def test_links_of_the_readme_lead_somewhere():
 def test_each_generated_part_stands_in_a_page():
     named = {name for path in TEXTS for name in GENERATED.findall(path.read_text("utf-8"))}
     assert named == set(generated_blocks(str, {}))
+
+
+def test_each_cause_of_a_mode_is_explained():
+    text = (PAGES / "reference" / "run-folder.md").read_text("utf-8")
+    assert [event.value for event in Event if f"`{event.value}`" not in text] == []

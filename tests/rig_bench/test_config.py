@@ -66,7 +66,7 @@ def test_good_file_is_read(tmp_path):
         ("[world, body]", "[world, wheel]", "struts.0.between.1 = 'wheel'", "expected body"),
         ("  body: body", "  body: wheel", "applied_force.body = 'wheel'", "expected body"),
         ("frequency_hz: 1.0", "phase_rad: 1.0", "applied_force.components.0", "frequency_hz"),
-        ("kind: sine", "kind: square", "applied_force.components.0.kind: 'square'", "one of sine, "),
+        ("kind: sine", "kind: square", "components.0.kind: 'square'", "one of sine, "),
         ("kind: sine", "kind: multisine", "multisine.amplitude_n: unknown key", "one of kind, "),
         ("name: bump_stop", "name: bumper", "undeclared_effects.0", "one of preload"),
         ("    strut: strut\n", "    strut: leg\n", "effects.0.strut = 'leg'", "expected strut"),
