@@ -84,8 +84,9 @@ def _read_file(source: Path) -> Mapping[str, Array]:
     except Exception as error:
         # Foreign readers raise anything on a file that is cut or malicious.
         kind = source.suffix.lstrip(".").upper()
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(
-            f"{source}: is no valid {kind} file, or is damaged: export it again"
+            f"{source}: is no valid {kind} file, or is damaged ({reason}): export it again"
         ) from error
 
 

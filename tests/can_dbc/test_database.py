@@ -201,8 +201,8 @@ def test_what_only_describes_is_passed_over(write_dbc: Callable[..., Path]) -> N
 
 
 def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in (tmp_path, tmp_path / "missing.dbc"):
-        with pytest.raises(DatabaseError, match="no such file"):
+    for path, kind in ((tmp_path, "is a folder"), (tmp_path / "missing.dbc", "no such file")):
+        with pytest.raises(DatabaseError, match=f"{kind}, expected a DBC file"):
             load_database(path)
     with pytest.raises(DatabaseError, match="expected a DBC"):
         load_database(Path("a\0b\n"))

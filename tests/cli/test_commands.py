@@ -97,7 +97,7 @@ def test_check_refuses_what_cannot_work(
 WRONG_CONFIGS = {
     "no YAML": ("a: [", "YAML"),
     "a list": ("- 1\n", "keys and values"),
-    "empty": ("", "nothing"),
+    "empty": ("", "is empty"),
     "unknown key": ('{"ratte_hz": 3}', "ratte_hz"),
     "rate of zero": ('{"rate_hz": 0}', "rate_hz"),
     "key twice": ("rate_hz: 1\nrate_hz: 2\n", "twice"),

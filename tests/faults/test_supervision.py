@@ -368,7 +368,7 @@ def test_every_way_out_of_the_safe_state_is_somebodys_decision():
         ({"value": "force_kn", "high": 1, "action": "warn"}, "measured_height_m"),
         (
             {"value": "force_n", "high": 1, "action": "explode"},
-            "'warn', 'refuse', 'hold' or 'safe'",
+            "expected one of warn, refuse, hold, safe",
         ),
         ({"value": "force_n", "high": ".nan", "action": "warn"}, "high"),
         ({"value": "force_n", "high": 1, "action": "warn", "unit": "N"}, "unknown key"),

@@ -32,7 +32,7 @@ def ready():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (f"{GAIN}=-1", "greater than or equal to 0"),
+        (f"{GAIN}=-1", "expected 0 or more"),
         (f"{GAIN}=fast", "fast"),
         ("observers.strut.gain=1", "no 'gain', expected one of kind, proportional_n_per_m"),
         ("observers.wheel.kind=pi", "no 'wheel', expected one of strut"),
@@ -74,7 +74,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
             bridge = requests.changes(42_000_000)
         asking.join()
         assert requests.changes(43_000_000) is None
-        with pytest.raises(InputError, match="greater than or equal"):
+        with pytest.raises(InputError, match="expected 0 or more"):
             ask(run, {"set": {GAIN: -5}})
         with pytest.raises(InputError, match="is not a valid request"):
             ask(run, {"sett": 1})
@@ -184,7 +184,7 @@ def test_a_time_that_no_integer_holds_is_refused_and_the_next_request_is_answere
     requests = served(tmp_path, ready, [])
     path = tmp_path / "1.request"
     path.write_text(json.dumps({"set": {f"supervision.{key}": 1e300}}))
-    assert "less than or equal" in requests._answer(path)["error"]
+    assert "expected 1e+09 or less" in requests._answer(path)["error"]
 
 
 @pytest.mark.parametrize("line", ['{"t_ns": 1e999, "set": {}}', "[" * 100_000])

@@ -17,7 +17,7 @@ from tests.run.listed import ListPort, bench_frames, live
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-OF_OTHERS = ("dask[distributed]",)
+OF_OTHERS = ("dask[distributed]", "pyserial")
 """Projects of others that a message names."""
 HASHES = ".hashes.txt"
 _HINT = re.compile(r"""\bpip\s+install\s+((?:-\S+\s+|[.]constraints[.]txt\s+)*)['"]?([^\s'"`)]+)""")

@@ -2,15 +2,12 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rig
 from can_dbc.errors import InputError
-from dart_model.effects import CATALOGUE, FAMILY_WORDS
-from rig.guide.reference import write_reference
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from tests.bridge.cores import FIRST
@@ -76,34 +73,3 @@ def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
         "diagnosis.json", "corrected.yaml", "report.html"
     }  # fmt: skip
     assert shares[-1] == 1.0
-
-
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("reference") / "new"
-    return write_reference(folder, {"run": "Usage: rig run CONFIG"}).read_text("utf-8")
-
-
-def test_the_reference_holds_every_effect_key_and_command(reference):
-    text = reference
-    for name, effect in CATALOGUE.items():
-        if effect.family not in FAMILY_WORDS:
-            continue  # the null partner of all effects
-        assert f'id="{name}"' in text
-    for key in ("rate_hz", "bus.bitrate", "supervision.limits.action", "log.rotate_s", "engine"):
-        assert f"<code>{key}</code>" in text
-    assert "Usage: rig run CONFIG" in text
-    assert text.count("<img ") > 30
-    assert "http" not in text.replace("https://", "").replace("http://www.w3.org", "")
-
-
-def test_the_reference_says_what_every_key_means(reference):
-    text = reference
-    configuration = text[text.index('id="configuration"') : text.index('id="bus"')]
-    assert "<td></td></tr>" not in configuration
-
-
-def test_the_reference_is_one_line_where_it_cannot_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_reference(Path(tmp_path / "file" / "reference"), {})

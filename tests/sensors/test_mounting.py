@@ -132,7 +132,7 @@ def test_a_wrong_call_is_one_line(tmp_path, arguments, expected):
 
 def test_a_moving_strut_has_no_zero():
     t_s = np.linspace(0.0, 2.0, 2001)
-    with pytest.raises(InputError, match=r"moves over 3.* mm in 2 s, expected a strut at rest"):
+    with pytest.raises(InputError, match=r"moves over 3.* mm in 2 s, expected at most 1 mm"):
         find_zero(
             summarise(t_s, 0.1 + 1.8e-3 * np.sin(9.0 * t_s)),
             0.4,

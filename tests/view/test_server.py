@@ -176,7 +176,7 @@ def test_the_page_says_what_a_folder_is(states):
         "file": "unreadable",
         "absent": "absent",
     }
-    assert "schema: 1: expected 3" in found["schema"]["words"]
+    assert "schema 1: expected 3" in found["schema"]["words"]
     assert "rig replay" in found["killed"]["words"]
     assert 0 < found["killed"]["steps"] < COUNT
     assert found["live"]["steps"] > 0
