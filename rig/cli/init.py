@@ -24,7 +24,7 @@ from rig.cli.terminal import (
 if TYPE_CHECKING:
     from can_dbc.database import Database
     from rig.new_bench.first_model import FirstModel, LinearFit
-    from rig.new_bench.proposal import Proposal, Signals
+    from rig.new_bench.proposal import Force, Proposal, Signals
 
 EXAMPLES = (
     "Examples: `rig init --dbc my.dbc --out my.yaml`, which asks for the rest · `rig init --dbc "
@@ -182,10 +182,7 @@ def _find_signals(
     unclear = unclear_forces(database, [it for it in forces.values() if it]) if open_forces else []
     if unclear and sys.stdin.isatty():
         for item in unclear[: len(open_forces)]:
-            answer = typer.prompt(
-                f"{item.name} is a force: applied to the body, in the strut, or neither? (a/s/n)"
-            )
-            force = {"a": Force.APPLIED, "s": Force.IN_STRUT}.get(str(answer).strip().lower()[:1])
+            force = _ask_place(item.name)
             if force in open_forces:
                 forces[force] = find_force(database, force, item.name)
         unclear = []
@@ -194,6 +191,17 @@ def _find_signals(
         raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
     temperature = find_temperature(database, found.message.sender)
     return Signals(found, chosen, temperature, tuple(unclear))
+
+
+def _ask_place(name: str) -> "Force | None":
+    """Where a force acts, as the user answers; None for neither place."""
+    from rig.new_bench.proposal import Force
+
+    question = f"{name} is a force: applied to the body, in the strut, or neither? (a/s/n)"
+    answers = {"a": Force.APPLIED, "s": Force.IN_STRUT, "n": None}
+    while (answer := str(typer.prompt(question)).strip().lower()[:1]) not in answers:
+        print_text("Expected a, s or n.")
+    return answers[answer]
 
 
 def _first_model(
