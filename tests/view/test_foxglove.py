@@ -217,7 +217,7 @@ def test_a_playback_stops_at_its_end():
 
 def test_a_wrong_folder_and_a_taken_port_are_said(original, tmp_path, published):
     (tmp_path / "file").write_text("no run")
-    with pytest.raises(InputError, match="no such folder, expected the folder of a run"):
+    with pytest.raises(InputError, match="is no folder, expected a run"):
         published(tmp_path / "file")
     port = int(published(original).address.rpartition(":")[2])
     with pytest.raises(InputError, match=rf"--port {port}: .*expected a port that is free"):
