@@ -244,7 +244,10 @@ def test_a_live_run_is_followed(made, tmp_path):
             opened.select_option("#key", "observers.strut.proportional_n_per_m")
             opened.fill("#value", "-1")
             opened.click("#change button")
-            until(opened, "document.getElementById('answer').textContent.includes('expected 0 or more')")
+            until(
+                opened,
+                "document.getElementById('answer').textContent.includes('expected 0 or more')",
+            )
             opened.fill("#value", "5e4")
             opened.click("#change button")
             until(opened, "document.getElementById('answer').textContent.startsWith('Changed')")
