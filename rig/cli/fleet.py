@@ -136,7 +136,7 @@ def run_command(
     else:
         print_text(end.words)
         if end.failed:
-            sql = "SELECT run, error FROM runs WHERE error IS NOT NULL"
+            sql = "SELECT source, error FROM runs WHERE error <> ''"
             print_text(f'Which, and why: `rig fleet query {out} "{sql}"`')
         print_text(f"Store: {out}")
     return FAILED if end.failed else OK
