@@ -1,7 +1,7 @@
 """Pages of the guide that hold measured tables: each is written by the program that measured it.
 
 A page is one file under `rig/guide/pages/evidence`. Its command, date, version and machine stand in
-it, so that a reader can repeat it, and nobody has to believe a figure that was typed.
+it, so that a reader can repeat it; no figure is typed.
 """
 
 import argparse

@@ -1,5 +1,6 @@
 """`rig init`."""
 
+import math
 import os
 import sys
 import tempfile
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.progress import progress_line, stoppable
+from rig.cli.progress import listen_visibly
 from rig.cli.terminal import (
     Bitrate,
     Channel,
@@ -39,59 +40,66 @@ _NONE = "none"
 _ROUGH_HZ = 2.0
 """Natural frequency of the model by which a recording is read: it has no effect on what is read."""
 
-Named = Annotated[str | None, typer.Option(metavar="MESSAGE.SIGNAL")]
+Dbc = Annotated[Path, typer.Option(metavar="FILE", help="DBC of the bench's bus.")]
+Out = Annotated[
+    Path, typer.Option(metavar="FILE", help="New configuration; its model is written next to it.")
+]
+Height = Annotated[
+    str | None,
+    typer.Option(metavar="MESSAGE.SIGNAL", help="The height, if not the likeliest signal."),
+]
+AppliedForce = Annotated[
+    str | None, typer.Option(metavar="MESSAGE.SIGNAL", help="Force on the body, or `none`.")
+]
+LoadCell = Annotated[
+    str | None,
+    typer.Option(metavar="MESSAGE.SIGNAL", help="Force measured in the strut, or `none`."),
+]
+Mass = Annotated[
+    float | None,
+    typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries."),
+]
+LengthAtRest = Annotated[
+    float | None,
+    typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest."),
+]
+Stiffness = Annotated[
+    float | None,
+    typer.Option(metavar="N/M", min=1e-3, max=1e9, help="Stiffness, from a catalogue."),
+]
+Damping = Annotated[
+    float | None,
+    typer.Option(
+        metavar="N.S/M", min=0.0, max=1e8, help="Damping; a damping ratio of 0.2 if absent."
+    ),
+]
+Run = Annotated[
+    Path | None,
+    typer.Option(metavar="RUN", help="Stiffness and damping from a run's folder or a CSV file."),
+]
+ListenSeconds = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S", min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."
+    ),
+]
 
 
 def init(
-    dbc: Annotated[Path, typer.Option(metavar="FILE", help="DBC of the bench's bus.")],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="New configuration; its model stands beside it.")
-    ],
-    height: Annotated[
-        str | None,
-        typer.Option(metavar="MESSAGE.SIGNAL", help="The height, if not the likeliest signal."),
-    ] = None,
-    applied_force: Annotated[
-        str | None,
-        typer.Option(metavar="MESSAGE.SIGNAL", help="Force on the body, or `none`."),
-    ] = None,
-    load_cell: Annotated[
-        str | None,
-        typer.Option(metavar="MESSAGE.SIGNAL", help="Force measured in the strut, or `none`."),
-    ] = None,
+    dbc: Dbc,
+    out: Out,
+    height: Height = None,
+    applied_force: AppliedForce = None,
+    load_cell: LoadCell = None,
     is_dyno: Annotated[
         bool, typer.Option("--dyno", help="The bench prescribes the strut's motion.")
     ] = False,
-    mass_kg: Annotated[
-        float | None,
-        typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries."),
-    ] = None,
-    length_at_rest_m: Annotated[
-        float | None,
-        typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest."),
-    ] = None,
-    stiffness_n_per_m: Annotated[
-        float | None,
-        typer.Option(metavar="N/M", min=1e-3, max=1e9, help="Stiffness, from a catalogue."),
-    ] = None,
-    damping_n_s_per_m: Annotated[
-        float | None,
-        typer.Option(
-            metavar="N.S/M", min=0.0, max=1e8, help="Damping; a damping ratio of 0.2 if absent."
-        ),
-    ] = None,
-    run: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RUN", help="Stiffness and damping from a run's folder or a CSV file."
-        ),
-    ] = None,
-    listen_s: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S", min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."
-        ),
-    ] = None,
+    mass_kg: Mass = None,
+    length_at_rest_m: LengthAtRest = None,
+    stiffness_n_per_m: Stiffness = None,
+    damping_n_s_per_m: Damping = None,
+    run: Run = None,
+    listen_s: ListenSeconds = None,
     interface: Interface = "socketcan",
     channel: Channel = "can0",
     bitrate: Bitrate = 500_000,
@@ -103,7 +111,8 @@ def init(
     each was chosen and what else it may be. What the options leave open is asked for in a terminal.
     """
     from can_dbc.database import load_database
-    from rig.new_bench.proposal import Bus, Proposal
+    from rig.bus.bus import BusConfig
+    from rig.new_bench.proposal import Proposal
 
     model_file = out.with_name(f"{out.stem}_model.yaml")
     refuse_existing(out, model_file, option="--out ")
@@ -111,7 +120,7 @@ def init(
         raise InputError("expected one of --run and --listen-s")
     database = load_database(dbc)
     signals = _find_signals(database, height, applied_force, load_cell, is_dyno=is_dyno)
-    proposal = Proposal(database, signals, Bus(interface, channel, bitrate), is_dyno)
+    proposal = Proposal(database, signals, BusConfig(interface, channel, bitrate), is_dyno)
     mass_kg = _known(
         mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
     )
@@ -133,9 +142,9 @@ def init(
         source = f"from {'the bus' if run is None else run}, explaining {fit.explained:.0%} of it"
     _write(proposal, out, model_file, model, source)
     if as_json:
-        print_json(_as_dict(out, model_file, database, signals, model))
+        print_json(_as_dict(out, model_file, proposal, model))
         return
-    _print(out, model_file, database, signals, model, source)
+    _print(out, model_file, proposal, model, source)
 
 
 def _known(value: float | None, option: str, question: str, default: float | None) -> float:
@@ -209,7 +218,7 @@ def _first_model(
 ) -> "tuple[FirstModel, str]":
     from rig.new_bench.first_model import FirstModel, rough_damping_n_s_per_m
 
-    stiffness = stiffness_n_per_m or mass_kg * (6.2832 * _ROUGH_HZ) ** 2
+    stiffness = stiffness_n_per_m or mass_kg * (math.tau * _ROUGH_HZ) ** 2
     if damping_n_s_per_m is None:
         damping, source = rough_damping_n_s_per_m(mass_kg, stiffness), "its damping a guess"
     else:
@@ -251,20 +260,17 @@ def _measure(
 def _listen(proposal: "Proposal", model: "FirstModel", listen_s: float, folder: Path) -> Path:
     """Record the bus as proposed; returns the run's folder."""
     from rig.plan.load import load_plan
-    from rig.run.loop import RunControl
-    from rig.sensors.mounting import listen
 
     config, run = folder / "rig.yaml", folder / "run"
     _write(proposal, config, config.with_name("model.yaml"), model, "to listen by")
-    with stoppable() as stop, progress_line(listen_s) as progress:
-        control = RunControl(stop=stop, progress=progress)
-        listen(load_plan(config), listen_s, run, control)
+    listen_visibly(load_plan(config), listen_s, run)
     return run
 
 
 def _as_dict(
-    out: Path, model_file: Path, database: "Database", signals: "Signals", model: "FirstModel"
+    out: Path, model_file: Path, proposal: "Proposal", model: "FirstModel"
 ) -> dict[str, object]:
+    signals = proposal.signals
     return {
         "config": str(out),
         "model": str(model_file),
@@ -283,18 +289,14 @@ def _as_dict(
         "free_length_m": model.free_length_m,
         "stiffness_n_per_m": model.stiffness_n_per_m,
         "damping_n_s_per_m": model.damping_n_s_per_m,
-        "passed_over": dict(database.passed_over),
+        "passed_over": dict(proposal.database.passed_over),
     }
 
 
 def _print(
-    out: Path,
-    model_file: Path,
-    database: "Database",
-    signals: "Signals",
-    model: "FirstModel",
-    source: str,
+    out: Path, model_file: Path, proposal: "Proposal", model: "FirstModel", source: str
 ) -> None:
+    database, signals = proposal.database, proposal.signals
     for choice in signals.choices:
         print_text(f"{choice.quantity.key}: {choice.name} ({choice.comment})")
     for item in signals.unclear:

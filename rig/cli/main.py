@@ -40,8 +40,16 @@ from rig.machine.installed_versions import version_of
 
 __all__ = ["app", "main"]
 
-_GROUPS = ("sensor", "fleet")
-"""Groups of commands."""
+_SET_UP, _RUN, _EVALUATE, _EXCHANGE = (
+    "Set up a bench",
+    "Run the bridge",
+    "Evaluate",
+    "Exchange and read",
+)
+"""Heads of the commands in the help."""
+
+_GROUPS = {"sensor": (sensor.app, _SET_UP), "fleet": (fleet.app, _EVALUATE)}
+"""Groups of commands, and their heads in the help."""
 
 app = typer.Typer(
     name="rig",
@@ -51,14 +59,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-_SET_UP, _RUN, _EVALUATE, _EXCHANGE = (
-    "Set up a bench",
-    "Run the bridge",
-    "Evaluate",
-    "Exchange and read",
-)
-"""Heads of the commands in the help."""
-
 for _name, _function, _examples, _panel in (
     ("demo", demo.demo, demo.EXAMPLES, _RUN),
     ("init", init.init, init.EXAMPLES, _SET_UP),
@@ -80,8 +80,8 @@ for _name, _function, _examples, _panel in (
     ("docs", docs.docs, docs.EXAMPLES, _EXCHANGE),
 ):
     app.command(_name, epilog=_examples, rich_help_panel=_panel, cls=PlainCommand)(_function)
-app.add_typer(sensor.app, name=_GROUPS[0], rich_help_panel=_SET_UP)
-app.add_typer(fleet.app, name=_GROUPS[1], rich_help_panel=_EVALUATE)
+for _name, (_group, _panel) in _GROUPS.items():
+    app.add_typer(_group, name=_name, rich_help_panel=_panel)
 
 
 def _show_version(is_requested: bool) -> None:
@@ -166,10 +166,9 @@ def _name_value(message: str, words: Sequence[str]) -> str:
 
 def _commands(words: Sequence[str]) -> list[str]:
     """Names of the commands, or of those of the group that was called."""
-    groups = {"sensor": sensor.app, "fleet": fleet.app}
-    called = groups.get(words[0] if words else "", app)
+    called, _ = _GROUPS.get(words[0] if words else "", (app, ""))
     names = [str(item.name) for item in called.registered_commands]
-    return names if called is not app else [*names, *groups]
+    return names if called is not app else [*names, *_GROUPS]
 
 
 def _refuse(why: str) -> None:

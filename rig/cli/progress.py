@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
     from rig.bridge.values import Mode
+    from rig.plan.plan import Plan
     from rig.run.loop import Look
 
 
@@ -175,3 +177,16 @@ def progress_line(duration_s: float | None) -> Generator[Callable[[int, "Mode"],
     finally:
         if is_terminal:
             _write(b"\r\x1b[K")
+
+
+def listen_visibly(plan: "Plan", listen_s: float, run: Path) -> None:
+    """Record a run that sends nothing, with a line of progress; Ctrl-C ends it in order.
+
+    Raises:
+        InputError: The bus cannot be opened, or the folder cannot be written.
+    """
+    from rig.run.loop import RunControl
+    from rig.sensors.mounting import listen
+
+    with stoppable() as stop, progress_line(listen_s) as progress:
+        listen(plan, listen_s, run, RunControl(stop=stop, progress=progress))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError, expected_name
-from rig.cli.progress import progress_line, stoppable
+from rig.cli.progress import listen_visibly
 from rig.cli.terminal import ConfigFile, JsonFlag, print_json, print_text
 
 if TYPE_CHECKING:
@@ -102,14 +102,12 @@ def _channel(plan: "Plan", strut: str | None, tare: str | None) -> "Channel":
 
 
 def _read(plan: "Plan", name: str, listen_s: float, run: Path | None) -> "Readings":
-    from rig.run.loop import RunControl
-    from rig.sensors.mounting import listen, readings_of
+    from rig.sensors.mounting import readings_of
 
     if run is not None:
         return readings_of(run, plan, name)
-    with tempfile.TemporaryDirectory() as folder, stoppable() as stop:
-        with progress_line(listen_s) as progress:
-            listen(plan, listen_s, Path(folder) / "run", RunControl(stop=stop, progress=progress))
+    with tempfile.TemporaryDirectory() as folder:
+        listen_visibly(plan, listen_s, Path(folder) / "run")
         return readings_of(Path(folder) / "run", plan, name)
 
 

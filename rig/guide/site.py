@@ -6,6 +6,7 @@ is in its folder: pages and search work from a file, without a network.
 """
 
 import importlib
+import io
 import logging
 import re
 import shutil
@@ -127,15 +128,17 @@ def build_site(folder: Path, blocks: Mapping[str, Block]) -> Path:
 
 def _build_strictly(build: Callable[[], None]) -> None:
     """Build, and raise what MkDocs warns of, such as a link that leads nowhere."""
-    found: list[str] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    found = io.StringIO()
+    handler = logging.StreamHandler(found)
+    handler.setLevel(logging.WARNING)
     logger = logging.getLogger("mkdocs")
     logger.addHandler(handler)
     try:
         build()
     except SystemExit:
-        raise InputError(f"the guide cannot be built: {'; '.join(found)}") from None
+        raise InputError(
+            f"the guide cannot be built: {'; '.join(found.getvalue().splitlines())}"
+        ) from None
     finally:
         logger.removeHandler(handler)
 

@@ -23,6 +23,7 @@ from can_dbc.errors import InputError
 Array = NDArray[np.float64]
 
 GRAVITY_M_PER_S2 = 9.81
+"""Standard gravity to the digits of a model file's default."""
 
 ROUGH_DAMPING_RATIO = 0.2
 """Of a bench whose damper is unknown: a shock absorber in a vehicle has 0.2 to 0.4 (Dixon, "The
@@ -38,6 +39,7 @@ _FEWEST_SAMPLES = 16
 """In a window: its integrals are sums."""
 
 _FEWEST_WINDOWS = 30
+"""Ten equations for each of the three unknowns."""
 
 _LEAST_EXPLAINED = 0.5
 """Share of the inertia's variance that the linear model explains, below which it is no model."""

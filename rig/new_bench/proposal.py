@@ -13,6 +13,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal, alive_counter
 from can_dbc.errors import DatabaseError, InputError, expected_name
 from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
+from rig.bus.bus import BusConfig
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     HEIGHT,
@@ -25,6 +26,7 @@ from rig.new_bench.signal_ranking import (
     LIKELY,
     Likeness,
     RankedSignal,
+    full_name,
     measures,
     rank_signals,
     words_without_unit,
@@ -51,6 +53,8 @@ _STALE_CYCLES = 3
 """Cycles after which a height is stale: two frames in a row may be lost."""
 
 _LEAST_STALE_S = 0.01
+"""Time by which an ordinary kernel may delay frames of a faster sensor."""
+
 _LARGEST_RATE_M_PER_S = 10.0
 """Of a height: several times what a damper is tested at."""
 
@@ -90,7 +94,7 @@ class Choice:
     @property
     def name(self) -> str:
         """Message and signal, with a dot between."""
-        return f"{self.message.name}.{self.signal.name}"
+        return full_name(self.message, self.signal)
 
     @property
     def comment(self) -> str:
@@ -227,15 +231,6 @@ def _choice(quantity: Quantity, best: RankedSignal, ranked: Sequence[RankedSigna
 
 
 @dataclass(frozen=True)
-class Bus:
-    """How the bus is opened."""
-
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: int = 500_000
-
-
-@dataclass(frozen=True)
 class Proposal:
     """What a bench's configuration is made of.
 
@@ -245,7 +240,7 @@ class Proposal:
 
     database: Database
     signals: Signals
-    bus: Bus
+    bus: BusConfig
     is_motion_prescribed: bool
 
     def text(self, dbc: str, model: str) -> str:

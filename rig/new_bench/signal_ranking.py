@@ -59,7 +59,7 @@ class RankedSignal:
     @property
     def name(self) -> str:
         """Message and signal, with a dot between."""
-        return f"{self.message.name}.{self.signal.name}"
+        return full_name(self.message, self.signal)
 
     @property
     def why(self) -> str:
@@ -161,13 +161,18 @@ def rank_signals(messages: Iterable[Message], likeness: Likeness) -> list[Ranked
 def words_without_unit(messages: Iterable[Message], likeness: Likeness) -> list[str]:
     """Signals whose names fit and which the DBC gives no unit, the best first."""
     found = [
-        (sum(weights.values()), f"{message.name}.{signal.name}")
+        (sum(weights.values()), full_name(message, signal))
         for message in messages
         for signal in message.signals.values()
         if not signal.unit and signal.length_bits > 1
         if (weights := _words(likeness.words, signal.name)) and sum(weights.values()) >= _CLEAR_WORD
     ]
     return [name for _, name in sorted(found, key=lambda item: -item[0])]
+
+
+def full_name(message: Message, signal: Signal) -> str:
+    """Message and signal, with a dot between."""
+    return f"{message.name}.{signal.name}"
 
 
 def measures(signal: Signal, dimension: Dimension) -> bool:

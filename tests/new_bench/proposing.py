@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from can_dbc.database import Database, load_database
+from rig.bus.bus import BusConfig
 from rig.new_bench.proposal import (
-    Bus,
     Force,
     Proposal,
     Signals,
@@ -24,6 +24,9 @@ def find_signals(database: Database) -> Signals:
 
 def propose(path: Path, model: str = "reference") -> str:
     database = load_database(path)
-    return Proposal(database, find_signals(database), Bus(), is_motion_prescribed=False).text(
-        path.name, model
-    )
+    return Proposal(
+        database,
+        find_signals(database),
+        BusConfig("socketcan", "can0", 500_000),
+        is_motion_prescribed=False,
+    ).text(path.name, model)
