@@ -21,6 +21,7 @@ from rig.bridge.force_history import NO_HISTORY, ForceComparison, ForceHistory
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.supervision_limits import (
     COMPARED,
+    OF_SETTLED,
     RANGED,
     Action,
     Delay,
@@ -276,7 +277,7 @@ class Supervisor:
         ]
         """Limits with a delay, each with the index of its strut."""
         self._limits_before = [
-            [row for row in rows if row.value not in COMPARED] for rows in self._limits
+            [row for row in rows if row.value not in OF_SETTLED] for rows in self._limits
         ]
         self._ranges = list(map(range_of_estimate, self._limits))
         self._is_limited = any(self._limits)

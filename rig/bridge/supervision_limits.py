@@ -38,6 +38,7 @@ class LimitedValue(Enum):
     FORCE_N = "force_n"
     VIRTUAL_FORCE_N = "virtual_force_n"
     INNOVATION_M = "innovation_m"
+    FORCE_STD_N = "force_std_n"
     FORCE_RATE_N_PER_S = "force_rate_n_per_s"
     FORCE_DIFFERENCE_N = "force_difference_n"
 
@@ -72,8 +73,9 @@ class Limit(BaseModel):
             `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of
             another measured signal: `measured` and `measured_rate_per_s` in its unit by SI,
             `unchanged_s`. Of the estimate: `height_m`, `force_n`, `virtual_force_n`,
-            `innovation_m`; and of one that has settled `force_rate_n_per_s` (its change since the
-            last tick) and `force_difference_n` (the estimated force less that of the load cell).
+            `innovation_m`; and of one that has settled `force_std_n` (its standard deviation, as
+            its observer states it), `force_rate_n_per_s` (its change since the last tick) and
+            `force_difference_n` (the estimated force less that of the load cell).
         low: Smallest value within.
         high: Largest value within.
         for_s: How long an estimate has to be beyond the limit until the action begins; for
@@ -289,11 +291,15 @@ def values_of_estimate(strut: StrutOutput) -> EstimateValues:
         LimitedValue.FORCE_N: strut.force_n,
         LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
         LimitedValue.INNOVATION_M: strut.innovation_m,
+        LimitedValue.FORCE_STD_N: strut.force_std_n,
     }
 
 
 COMPARED = (LimitedValue.FORCE_RATE_N_PER_S, LimitedValue.FORCE_DIFFERENCE_N)
-"""Values of an estimate that need its history; they require nothing before it has settled."""
+"""Values of an estimate that need its history."""
+
+OF_SETTLED = (LimitedValue.FORCE_STD_N, *COMPARED)
+"""Values of an estimate that require nothing before it has settled."""
 
 
 def values_with_history(
@@ -406,5 +412,5 @@ def find_violations(
     return [
         (strut, row)
         for (strut, row), delay in zip(rows, delays, strict=True)
-        if delay.is_passed and (is_settled or row.value not in COMPARED)
+        if delay.is_passed and (is_settled or row.value not in OF_SETTLED)
     ]

@@ -65,6 +65,17 @@ GainMargin = Annotated[
     ),
 ]
 
+SettlingTime = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S",
+        min=0.001,
+        max=60.0,
+        help="Longest time until an estimate is valid after a start or a disturbance; 0.25 for "
+        "kalman, unlimited for pi by default.",
+    ),
+]
+
 
 def tune_command(
     config: ConfigFile,
@@ -85,6 +96,7 @@ def tune_command(
         float, typer.Option(metavar="RATIO", min=0.0, max=1.0, help="Least of all poles.")
     ] = 0.1,
     gain_margin: GainMargin = None,
+    settling_s: SettlingTime = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write the configuration, in the folder of CONFIG."),
@@ -105,7 +117,7 @@ def tune_command(
         raise InputError(f"--observer {observer!r}: {expected_name(observer, KINDS)}")
     refuse_existing(out, plot)
     source = _source(run, residual_n, up_to_hz, noise_std_m)
-    plan, aim = load_plan(config, model=model), Aim(damping_ratio, gain_margin)
+    plan, aim = load_plan(config, model=model), Aim(damping_ratio, gain_margin, settling_s)
     with progress_bar() as bar:
         struts = tune(plan, source, observer, aim, bar)
     if out is not None:
@@ -161,6 +173,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
         },
         "damping_ratio": chosen.expected.damping_ratio,
         "gain_margin": chosen.gain_margin,
+        "settling_s": chosen.expected.settling_s,
         "poles": [pole._asdict() for pole in chosen.expected.poles],
     }
 
@@ -205,6 +218,12 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
             f"{chosen.gain_margin:.3g}.",
             style="yellow",
         )
+    if chosen.expected.settling_s > 1.01 * chosen.required_settling_s:
+        console.print(
+            f"No gains settle within {chosen.required_settling_s:g} s; the best settle in "
+            f"{_time_text(chosen.expected.settling_s)}.",
+            style="yellow",
+        )
 
 
 def _print_errors(strut: "TunedStrut") -> None:
@@ -219,6 +238,7 @@ def _print_errors(strut: "TunedStrut") -> None:
     rows += [
         ("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", "", f"{PAPER_HZ:.3g} Hz"),
         ("least damping ratio", *(f"{error.damping_ratio:.3f}" for error in errors)),
+        ("settling time", *(_time_text(error.settling_s) for error in errors)),
         ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "", ""),
     ]
     heads = ("expected error of the force", "tuned", "configured", "published gains")
@@ -229,6 +249,10 @@ def _print_errors(strut: "TunedStrut") -> None:
             f"Tuning hardly helps: {tuned_n:.3g} N expected instead of {configured_n:.3g} N. A "
             "faster or less noisy height, or a model that lacks less, reduces the error further."
         )
+
+
+def _time_text(time_s: float) -> str:
+    return f"{time_s:.3g} s" if time_s < float("inf") else "never"
 
 
 def _error_text(error_n: float) -> str:

@@ -437,6 +437,10 @@ def _supervision(signals: Signals) -> list[str]:
         "    # A sensor that has frozen; remove the line for one that repeats itself at rest.",
         f"    - {{value: unchanged_s, high: {_FROZEN_S:g}, action: hold}}",
     ]
+    lines += [
+        "    # An estimate that is less certain than you accept: largest standard deviation, N.",
+        "    # - {value: force_std_n, high: 100, action: hold}",
+    ]
     if signals.measures(Force.APPLIED):
         lines += [
             "    # The same for the applied force, unless it may be constant for longer.",

@@ -55,6 +55,11 @@ _GAIN_MARGIN = 1.1
 """The residual force is cancelled with the effective mass that the model itself gives, which is
 known: the observer tolerates a tenth or a fifth."""
 
+_LONGEST_SETTLING_S = 0.25
+"""The estimate is invalid for as long after each start and each disturbance. Where the model lacks
+little, noise alone would choose a filter that needs a second for it, and that follows a new
+residual force as slowly."""
+
 _BANDWIDTHS = 30
 """Tried before the local search, in steps of a fifth: the error has several minima over the
 bandwidth where the force has spectral lines."""
@@ -200,7 +205,7 @@ class KalmanObserver:
             return cls("kalman", ErrorFilter.with_corner(corner, task), task.force_limit_n)
 
         grid = np.linspace(math.log(low), math.log(high), _BANDWIDTHS).tolist()
-        return Search(observer, [[value] for value in grid], 1, _GAIN_MARGIN)
+        return Search(observer, [[value] for value in grid], 1, _GAIN_MARGIN, _LONGEST_SETTLING_S)
 
     def bandwidth_hz(self, mobility_per_kg: float) -> float:
         del mobility_per_kg

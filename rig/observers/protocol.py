@@ -1,5 +1,6 @@
 """What an observer is, and what it exchanges with the step, the check and the tuning."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
@@ -210,12 +211,14 @@ class Search(NamedTuple):
         candidates: Vectors that are tried first.
         starts: How many of the best candidates a local search begins at.
         gain_margin: Gain margin that the loop must keep unless the user states another.
+        settling_s: The same for the longest settling time of the estimate.
     """
 
     observer: Callable[[Vector], "AnyTunableObserver"]
     candidates: Sequence[Sequence[float]]
     starts: int
     gain_margin: float
+    settling_s: float = math.inf
 
 
 class TuningTask(NamedTuple):

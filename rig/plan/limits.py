@@ -8,7 +8,7 @@ signal cannot carry is invalid. The innovation needs none, since its band follow
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from can_dbc.codec import si_range, si_step
@@ -31,6 +31,7 @@ def resolve_limits(
     source: Path,
     *,
     can_compare: bool,
+    without_std: Collection[str] = (),
 ) -> Limits:
     """Limits of each strut and of each channel.
 
@@ -40,11 +41,13 @@ def resolve_limits(
         channels: Channels of the bench.
         forces: Strut -> message and signal that publish its force.
         can_compare: Whether the bench has a load cell with which an estimate can be compared.
+        without_std: Struts whose observers do not know the standard deviation of the force.
         source: File of the configuration, for messages.
 
     Raises:
         InputError: A row names a strut that the model does not have or a channel that is not
-            measured, or needs a load cell that the bench does not have.
+            measured, or needs a load cell that the bench does not have, or a standard deviation
+            that the observer does not know.
     """
     others = [channel for channel in channels if channel.role is not Role.HEIGHT]
     for index, row in enumerate(configured):
@@ -52,6 +55,8 @@ def resolve_limits(
         if row.value is LimitedValue.FORCE_DIFFERENCE_N:
             _check_comparison(row, where, struts, can_compare)
         _check_name(row.strut, struts, f"{where}.strut", "no such strut")
+        if row.value is LimitedValue.FORCE_STD_N:
+            _check_std(row, where, struts, without_std)
         names = [channel.name for channel in others]
         _check_name(row.channel, names, f"{where}.channel", "not measured")
         _check_overlap(row, where, struts, channels)
@@ -128,6 +133,18 @@ def _check_comparison(row: Limit, where: str, struts: Sequence[str], can_compare
             f"{where}.strut: expected the strut that the load cell measures, one of "
             f"{', '.join(struts)}"
         )
+
+
+def _check_std(
+    row: Limit, where: str, struts: Sequence[str], without_std: Collection[str]
+) -> None:
+    """Refuse a limit on a standard deviation that an observer does not know."""
+    for strut in struts:
+        if strut in without_std and row.strut in (None, strut):
+            raise InputError(
+                f"{where}.value: {row.value.value}: observers.{strut} does not know it, expected "
+                "an observer that does, such as kind kalman"
+            )
 
 
 def _of_height(channel: Channel) -> Iterator[Limit]:

@@ -220,6 +220,7 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
             can_compare=(
                 config.prescribed_motion is None and LOAD_CELL_FORCE in config.signals.bench
             ),
+            without_std=[name for name, item in config.observers.items() if not item.knows_std],
         ),
     )
     if config.authentication is not None:

@@ -3,8 +3,8 @@
 The error is that of model and observer in closed loop, made linear on the model itself: the
 sensor's noise goes through to the force, and the residual force is followed with a lag. Both parts
 are closed forms of the linear loop (a Lyapunov equation, a frequency response); their sum is
-minimised over the gains, among those whose poles keep a damping ratio and whose loop keeps a gain
-margin.
+minimised over the gains, among those whose poles keep a damping ratio, whose loop keeps a gain
+margin and whose estimate settles in time.
 """
 
 import math
@@ -17,6 +17,7 @@ from scipy.optimize import minimize
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
 from rig.closed_loop.poles import Pole, poles_of
+from rig.closed_loop.settling import decay_time_ns
 from rig.closed_loop.strut_response import StrutResponse
 from rig.observers import OBSERVERS
 from rig.observers.pi import PUBLISHED_PER_S2
@@ -46,10 +47,12 @@ class Aim(NamedTuple):
         damping_ratio: Least damping ratio of its poles.
         gain_margin: Gain margin of the loop, upwards and downwards; None: that of the observer's
             kind.
+        settling_s: Longest settling time of the estimate; None: that of the observer's kind.
     """
 
     damping_ratio: float = 0.1
     gain_margin: float | None = None
+    settling_s: float | None = None
 
 
 class ExpectedError(NamedTuple):
@@ -60,11 +63,13 @@ class ExpectedError(NamedTuple):
             loop is unstable.
         lag_n: Root mean square of its error by the lag.
         poles: Poles of the loop, the slowest first.
+        settling_s: Settling time of the estimate; infinite where it never settles.
     """
 
     noise_n: float
     lag_n: float
     poles: Sequence[Pole]
+    settling_s: float
 
     @property
     def force_n(self) -> float:
@@ -84,12 +89,14 @@ class Tuned(NamedTuple):
     Attributes:
         gain_margin: Gain margin of its loop, upwards and downwards; 20 means that or more.
         required_margin: The gain margin that it was to keep.
+        required_settling_s: The settling time that it was to keep.
     """
 
     observer: AnyTunableObserver
     expected: ExpectedError
     gain_margin: float
     required_margin: float
+    required_settling_s: float
 
 
 class TuningProblem(NamedTuple):
@@ -152,11 +159,13 @@ def expect_error(problem: TuningProblem, observer: AnyObserver) -> ExpectedError
     linear = problem.linear(observer)
     poles = poles_of(linear.a, linear.interval_s)
     if not _is_stable(poles):
-        return ExpectedError(math.inf, math.inf, poles)
+        return ExpectedError(math.inf, math.inf, poles, math.inf)
     noise_n = linear.noise_gain_n_per_m() * problem.expectation.noise_std_m
     share = linear.lag_gain(problem.expectation.frequency_hz)
     lag_n = float(np.sqrt(np.sum(share**2 * problem.expectation.power_n2)))
-    return ExpectedError(noise_n, lag_n, poles)
+    decay_ns = decay_time_ns(linear)
+    settling_s = math.inf if decay_ns is None else observer.settling_ns(decay_ns) * 1e-9
+    return ExpectedError(noise_n, lag_n, poles, settling_s)
 
 
 def gain_margin(problem: TuningProblem, observer: AnyObserver) -> float:
@@ -182,6 +191,7 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
     )
     search = cast("type[AnyTunableObserver]", OBSERVERS[kind]).search(task)
     margin = search.gain_margin if aim.gain_margin is None else aim.gain_margin
+    longest_s = search.settling_s if aim.settling_s is None else aim.settling_s
 
     def cost(x: Vector) -> float:
         try:
@@ -194,6 +204,8 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
         short = max(0.0, aim.damping_ratio - error.damping_ratio)
         if not _has_margin(problem, observer, margin):
             short += 1.0
+        if error.settling_s > longest_s:
+            short += min(1.0, error.settling_s / longest_s - 1.0)
         # What misses the aim costs more than all that keeps it, and the more it misses.
         return math.log(error.force_n + 1e-12) + (1e3 * (1.0 + short) if short > 0.0 else 0.0)
 
@@ -212,7 +224,7 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
     )
     observer = search.observer(best.x).to_four_digits()
     error = expect_error(problem, observer)
-    return Tuned(observer, error, gain_margin(problem, observer), margin)
+    return Tuned(observer, error, gain_margin(problem, observer), margin, longest_s)
 
 
 def sweep_bandwidth(

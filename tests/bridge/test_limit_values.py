@@ -30,8 +30,8 @@ from rig.bridge.supervision_limits import (
 from rig.bridge.values import StrutOutput
 
 MS = 1_000_000
-OUTPUT = StrutOutput(20.0, 3.0, True, 0.4, 0.0, 0.0, 0.001)
-"""Force 20 N, virtual force 3 N, height 0.4 m, innovation 1 mm."""
+OUTPUT = StrutOutput(20.0, 3.0, True, 0.4, 0.0, 0.0, 0.001, 5.0)
+"""Force 20 ± 5 N, virtual force 3 N, height 0.4 m, innovation 1 mm."""
 
 
 def estimate(**changes):
@@ -40,7 +40,13 @@ def estimate(**changes):
 
 STRUT = estimate()
 
-ESTIMATES = {"height_m": 0.4, "force_n": 20.0, "virtual_force_n": 3.0, "innovation_m": 0.001}
+ESTIMATES = {
+    "height_m": 0.4,
+    "force_n": 20.0,
+    "virtual_force_n": 3.0,
+    "innovation_m": 0.001,
+    "force_std_n": 5.0,
+}
 MEASURED = ("measured_height_m", "measured_rate_m_per_s", "unchanged_s")
 OF_CHANNELS = ("measured", "measured_rate_per_s", "unchanged_s")
 bounds = st.one_of(st.none(), st.floats(-10.0, 10.0))

@@ -309,6 +309,20 @@ def test_a_delayed_limit_is_that_of_its_own_strut():
     assert same(state.cause, Cause(Event.BEYOND_HOLD, 1, "force_n", 20.0, 10.0))
 
 
+def test_an_estimate_that_is_too_uncertain_is_not_valid_and_settles_without_a_fault():
+    """While it settles its deviation is large, and that is no fault of the bench."""
+    estimator = Scripted()
+    certain = Limit(value="force_std_n", high=100.0, action="hold")
+    supervisor, modes = Supervisor(estimator, SUPERVISION, [(certain,)]), []
+    state = supervisor.init(0)
+    deviations = [(500.0, False), (60.0, True), (466.0, True), (90.0, True)]
+    for ms, (std_n, is_settled) in enumerate(deviations, start=1):
+        estimator.estimate = Estimate((replace(STRUT, force_std_n=std_n),), ms * MS, is_settled)
+        state, _, _ = supervisor.step(state, StepInput(ms * MS, ()))
+        modes.append(state.mode)
+    assert modes == [Mode.SETTLING, Mode.RUNNING, Mode.HOLD, Mode.RUNNING]
+
+
 def test_a_load_cell_is_compared_where_a_limit_needs_it():
     cell = Channel(3, Role.BENCH, LOAD_CELL_FORCE, "cell", "cell", -1, MS)
     compared = Limit(value="force_difference_n", high=10.0, action="hold")

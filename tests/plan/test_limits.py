@@ -121,6 +121,27 @@ def test_a_difference_from_a_load_cell_needs_one_and_its_strut():
     assert named in resolved([named], ("front", "rear"), can_compare=True)[1]
 
 
+def test_a_limit_on_a_standard_deviation_needs_an_observer_that_knows_it():
+    own = row(value="force_std_n", high=100.0)
+    assert own in resolved([own])[0]
+
+    def of_two(limit):
+        return resolve_limits(
+            [limit],
+            ("front", "rear"),
+            (height(0), height(1)),
+            {},
+            SOURCE,
+            can_compare=False,
+            without_std=["rear"],
+        ).struts
+
+    with pytest.raises(InputError, match=r"limits\.0\.value: force_std_n: observers\.rear does not"):
+        of_two(own)
+    front = row(value="force_std_n", high=100.0, strut="front")
+    assert front in of_two(front)[0]
+
+
 def test_a_strut_without_a_height_has_no_limit_of_it():
     assert resolved(heights=[]) == ((),)
 

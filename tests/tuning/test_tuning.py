@@ -124,6 +124,21 @@ def test_less_noise_and_less_force_give_a_smaller_error(late):
     assert quieter.observer.filter.bandwidth_hz > some.observer.filter.bandwidth_hz
 
 
+def test_an_observer_settles_in_time_although_noise_alone_would_make_it_slower(late):
+    """A model that lacks little: the slower the filter, the smaller the error."""
+    little = StatedExpectation(1.0, 0.3, 1e-4)
+    ready = load_plan(late / "rig.yaml")
+    [free], [usual], [fast] = (
+        tune(ready, little, "kalman", Aim(settling_s=longest_s), lambda _what, _share: None)
+        for longest_s in (60.0, None, 0.1)
+    )
+    assert free.tuned.expected.settling_s > 0.3
+    # The error grows with the bandwidth: the limit is reached, but for the rounding of gains.
+    assert 0.2 < usual.tuned.expected.settling_s < 0.2501
+    assert 0.08 < fast.tuned.expected.settling_s < 0.1001
+    assert free.tuned.expected.force_n < usual.tuned.expected.force_n
+
+
 def rig(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["rig", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
