@@ -61,7 +61,8 @@ def diagnose(
             "More is missing: diagnose once more what the corrected model lacks, by `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )
-    if result.diagnosis.effects or result.diagnosis.linear:
+    is_driven = result.diagnosis.held_out.strut_force_rmse_n is None
+    if is_driven and (result.diagnosis.effects or result.diagnosis.linear):
         print_text(
             f"Next: `rig run CONFIG --model {out}/corrected.yaml --listen-only --duration-s 20 "
             f"--out second`, then `rig tune CONFIG --model {out}/corrected.yaml --run second "

@@ -1,4 +1,4 @@
-"""What a command does with a run that has ended: its summary, its table, its exit code, what next."""
+"""The end of a run on the terminal: summary, table, exit code, the next command."""
 
 import contextlib
 import json

@@ -391,6 +391,7 @@ class HeightSensor(_Sensor):
 
     @property
     def offset(self) -> float:
+        """What it reads above the height, in m."""
         return self.offset_m
 
 
@@ -407,6 +408,7 @@ class AppliedForceSensor(_Sensor):
 
     @property
     def offset(self) -> float:
+        """What it reads without a force, in N."""
         return self.offset_n
 
 
@@ -425,6 +427,7 @@ class LoadCell(_Sensor):
 
     @property
     def offset(self) -> float:
+        """What it reads without a force, in N."""
         return self.offset_n
 
 

@@ -1,4 +1,4 @@
-"""The examples: the commands of their READMEs, run as they are written there, find what they say."""
+"""The examples: the commands of their READMEs, run as written, find what the READMEs say."""
 
 import json
 import os
@@ -36,7 +36,13 @@ def test_every_example_is_listed_and_every_listed_one_is_there():
     assert sorted(listed) == sorted(folders) == sorted([*FOUND, "notebook"])
 
 
-@pytest.mark.parametrize("name", FOUND)
+SLOW = ("foreign_dbc", "quarter_car")
+"""Each takes a minute or two."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in SLOW)) for name in FOUND]
+)
 def test_an_example_finds_what_its_bench_has(tmp_path, name):
     folder = tmp_path / name
     shutil.copytree(EXAMPLES / name, folder)
