@@ -127,6 +127,8 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
             raise FileError(f"{path}: is a pipe, expected a file")
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
+    except FileNotFoundError as error:
+        raise FileError(f"{path}: no such file") from error
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     if len(data) > max_bytes:
@@ -259,7 +261,8 @@ def _more(others: Sequence[Iterable[int | str]]) -> str:
         return ""
     keys = dict.fromkeys(".".join(map(str, _key_parts(item))) or "top level" for item in others)
     named = ", ".join(list(keys)[:_MOST_MORE]) + (", ..." if len(keys) > _MOST_MORE else "")
-    return f" (and {len(others)} more: {named})"
+    errors = "error" if len(others) == 1 else "errors"
+    return f" (and {len(others)} more {errors}: {named})"
 
 
 def _missing(parts: Sequence[int | str]) -> str:

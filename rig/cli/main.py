@@ -144,7 +144,7 @@ def main() -> None:
 
 
 _INVALID = re.compile(
-    r"Invalid value for '(?:[^']* / )?(--?[\w-]+)[^']*': (?:Input should be )?(.*)"
+    r"Invalid value for '(?:[^']* / )?(--?[\w-]+|\[?[A-Z]+\]?)[^']*': (?:Input should be )?(.*)"
 )
 
 
@@ -157,7 +157,7 @@ def _name_value(message: str, words: Sequence[str]) -> str:
     found = _INVALID.fullmatch(message)
     if found is None:
         return message
-    option, expected = found.groups()
+    option, expected = found[1].strip("[]"), found[2]
     expected = re.sub(r"^a valid (\w+),.*", r"a \1 alone, without a unit", expected)
     values = [after for word, after in pairwise(words) if word == option]
     value = f" {values[-1]}" if values else ""

@@ -135,6 +135,8 @@ def read_mf4(source: Path) -> RunContent:
     Raises:
         InputError: It is something else, or the package asammdf is missing.
     """
+    if not source.exists():
+        raise InputError(f"{source}: no such file")
     asammdf = _asammdf()
     try:
         mdf = asammdf.MDF(str(source))

@@ -147,10 +147,10 @@ def read_run(folder: Path) -> RunFolder:
     if not folder.is_dir():
         kind = "is a file" if folder.exists() else "no such folder"
         raise LogError(f"{folder}: {kind}, expected the folder of a run")
-    for name in (RUN_FILE, FRAMES_FILE, STEPS_FILE):
-        if not (folder / name).is_file():
-            raise LogError(f"{folder}: {name} is missing, expected a run{_runs_below(folder)}")
     header = read_header(folder)
+    for name in (FRAMES_FILE, STEPS_FILE):
+        if not (folder / name).is_file():
+            raise LogError(f"{folder}: {name} is missing, expected a run")
     damage = find_damage(folder)
     altered = [item.name for item in damage if not item.is_readable]
     steps = _read_steps([it for it in parts(folder, STEPS_FILE) if it.name not in altered])
@@ -172,6 +172,8 @@ def read_header(folder: Path) -> RunHeader:
     path = folder / RUN_FILE
     if path.exists() and not path.is_file():
         raise LogError(f"{path}: is no file, expected a run's header")
+    if not path.is_file():
+        raise LogError(f"{folder}: {RUN_FILE} is missing, expected a run{_runs_below(folder)}")
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
     if schema not in _READ_SCHEMAS:

@@ -98,7 +98,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, old, new, key, expectation)
 
 def test_number_of_further_errors_is_told(tmp_path):
     text = GOOD.replace("mass_kg: 10", "mass_kg: -1").replace("length_m: 0.5", "length_m: -2")
-    with pytest.raises(InputError, match=r"masses\.0\.mass_kg.*\(and 1 more: "):
+    with pytest.raises(InputError, match=r"masses\.0\.mass_kg.*\(and 1 more error: "):
         _load(tmp_path, text)
 
 
