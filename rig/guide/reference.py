@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from can_dbc.units import Dimension
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
@@ -124,19 +125,28 @@ def _bench_effects() -> str:
 
 def _measured_quantities() -> str:
     rows = [
-        (f"`{item.key}`", item.dimension.value, f"`{item.column}`", item.words)
-        for item in (HEIGHT, *BENCH_QUANTITIES)
+        (f"`{item.key}`", _unit(item.dimension), f"`{prefix}{item.column}`", item.words)
+        for prefix, items in (("STRUT.measured_", (HEIGHT,)), ("", BENCH_QUANTITIES))
+        for item in items
     ]
     return _table(("Key under `signals`", "Unit", "Column of the log", "Meaning"), rows)
 
 
 def _published_quantities() -> str:
     rows = [
-        (f"`{group}`", f"`{item.key}`", item.dimension.value, f"`{item.signal}`")
+        (f"`{group}`", f"`{item.key}`", _unit(item.dimension), f"`{item.signal}`", item.meaning)
         for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
         for item in items
     ]
-    return _table(("Under", "Key", "Unit", "Signal where only a message is given"), rows)
+    return _table(("Under", "Key", "Unit", "Default signal", "Meaning"), rows)
+
+
+_UNITS = {Dimension.NUMBER: "-", Dimension.TEMPERATURE: "°C", Dimension.ACCELERATION: "m/s²"}
+"""Units that a DBC spells in another way than a text."""
+
+
+def _unit(dimension: Dimension) -> str:
+    return _UNITS.get(dimension, dimension.value)
 
 
 def _families() -> str:
@@ -262,8 +272,10 @@ def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str
 
 
 def _default_text(default: object) -> str:
-    if default is None:
+    if default is None or default in ((), {}):
         return "none"
+    if isinstance(default, tuple):
+        return f"[{', '.join(map(_default_text, cast('tuple[object, ...]', default)))}]"
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 
