@@ -463,7 +463,7 @@ def test_an_applied_force_of_its_own_message_that_stops(promise, truth_n, settle
 
         return follow(trial, Event("", frames=frames))
 
-    words = "the applied force has a message of its own, which stops for 300 ms"
+    words = "the applied force is in a separate message, which stops for 300 ms"
     promise(40, words, *reaction(receive, truth_n, settled_n), STOP)
 
 

@@ -120,7 +120,10 @@ def _split_rows(dataset: str, split: _Split, folder: Path, progress: Progress) -
             before.append(error.before)
             after.append(error.after)
     how = f"computed here; training data {learnt}; {findings(result.diagnosis)}"
-    sources = {_LINEAR: (before, f"from {learnt}: by least squares"), CORRECTED: (after, how)}
+    sources = {
+        _LINEAR: (before, f"computed here; least squares, training data {learnt}"),
+        CORRECTED: (after, how),
+    }
     rows: list[Row] = []
     for name, (errors, source) in sources.items():
         if len(split.tests) > 1:
