@@ -1,6 +1,10 @@
 """The bodies and joints of a model in DART, from its YAML or from a file by DART's own parsers."""
 
-from collections.abc import Callable
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -144,18 +148,48 @@ def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
     refuse_endless(path)
     refuse_fatal(path)
     try:
-        skeleton = _PARSERS[suffix](str(path))
+        with _captured_stderr() as written:
+            skeleton = _PARSERS[suffix](str(path))
     except _OF_THE_PARSERS as error:
         reason = " ".join(str(error).split())[:200]
         raise ModelError(
             f"{path}: DART cannot read it ({reason}), expected a valid {suffix} file, whose values "
             "are numbers where they should be"
         ) from error
-    if skeleton is None:
-        raise ModelError(f"{path}: DART reads no skeleton from it, expected a valid {suffix} file")
+    reason = _first_error(written)
+    if skeleton is None or reason:
+        raise ModelError(
+            f"{path}: DART reads no skeleton from it{reason}, expected a valid {suffix} file"
+        )
     if suffix in MJCF_SUFFIXES:
         _refuse_bodies_without_shape(skeleton, path)
     return skeleton
+
+
+@contextlib.contextmanager
+def _captured_stderr() -> Generator[list[str]]:
+    """Lines that a parser in C++ writes to standard error, complete after the block.
+
+    They name the place of an error, which the parser does not return.
+    """
+    lines: list[str] = []
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as file:
+        kept = os.dup(2)
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            lines += file.read().decode("utf-8", "replace").splitlines()
+
+
+def _first_error(lines: Sequence[str]) -> str:
+    """The first error among a parser's lines, in brackets; empty if there is none."""
+    errors = (line.removeprefix("Error:") for line in lines if line.startswith("Error:"))
+    return next((f" ({' '.join(error.split())[:200]})" for error in errors), "")
 
 
 def _read_urdf(uri: str) -> DartSkeleton | None:

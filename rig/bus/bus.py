@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import logging
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -42,6 +43,9 @@ _LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "kvaser": {"driver_mode": False},
 }
 """What keeps a controller from acknowledging frames too. SocketCAN leaves this to `ip link`."""
+
+# A driver that is missing is logged where python-can is imported, and raised when it is opened.
+logging.getLogger("can").addHandler(logging.NullHandler())
 
 _STATES = MappingProxyType({state.name: state for state in can.BusState})
 _TIMINGS: Mapping[Callable[..., object], frozenset[str]] = MappingProxyType(

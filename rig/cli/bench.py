@@ -5,13 +5,25 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.progress import progress_line, stoppable
-from rig.cli.summary_file import SummaryFolder, write_summary
-from rig.cli.terminal import Bitrate, Channel, ConfigFile, Interface, console
+from can_dbc.errors import InputError
+from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end, refuse_bad_end
+from rig.cli.progress import progress_line, status_line, stoppable
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import (
+    Bitrate,
+    Channel,
+    ConfigFile,
+    Interface,
+    JsonFlag,
+    console,
+    print_json,
+)
+from rig.files.folders import refuse_full
 
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
-    "`rig bench my_bench.yaml --bridge rig.yaml --out runs/bench`"
+    "`rig bench my_bench.yaml --bridge rig.yaml --out runs/bench` · without a bus: "
+    "`rig bench my_bench.yaml --bridge rig.yaml --lockstep --duration-s 20 --out runs/1`"
 )
 
 
@@ -34,9 +46,32 @@ def bench(
             help="Take bus, DBC and authentication from a bridge's configuration instead.",
         ),
     ] = None,
-    out: SummaryFolder = None,
+    lockstep: Annotated[
+        bool,
+        typer.Option(
+            "--lockstep",
+            help="Run that bridge too, both in simulated time, as fast as the machine allows and "
+            "without a bus.",
+        ),
+    ] = False,
+    model: Annotated[
+        str | None,
+        typer.Option(metavar="MODEL", help="With --lockstep: another model than the bridge's."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Folder for summary.json; with --lockstep that of the bridge's run."
+        ),
+    ] = None,
+    as_json: JsonFlag = False,
 ) -> None:
-    """Run a simulated bench on a bus, in real time."""
+    """Run a simulated bench on a bus, in real time, or together with its bridge."""
+    if lockstep:
+        if bridge is None or out is None:
+            raise InputError("--lockstep: expected --bridge CONFIG and --out DIR with it")
+        _run_with_bridge(config, bridge, model, out, duration_s, as_json=as_json)
+        return
     from rig.bus.bus import BusConfig
     from rig.plan.load import load_plan
     from rig.run.live import run_bench
@@ -58,5 +93,47 @@ def bench(
             authentication=authentication,
             duration_s=duration_s,
         )
-    console.print(f"Sent {frames} frames.")
-    write_summary(out, {"bench": bench_config.name, "frames": frames})
+    summary: dict[str, object] = {"bench": bench_config.name, "frames": frames}
+    if as_json:
+        print_json(summary)
+    else:
+        console.print(f"Sent {frames} frames.")
+    write_summary(out, summary)
+
+
+def _run_with_bridge(
+    config: Path,
+    bridge: Path,
+    model: str | None,
+    out: Path,
+    duration_s: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    from dataclasses import replace
+
+    from rig.plan.load import load_plan
+    from rig.plan.preflight_checks import errors
+    from rig.run.live import with_bench
+    from rig.run.loop import RunControl
+    from rig.simulated_bench.config import load_bench_config
+
+    plan = load_plan(bridge, model=model, duration_s=duration_s)
+    bench_config = load_bench_config(config)
+    wrong = errors(plan)
+    if wrong:
+        raise InputError(f"{bridge}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all)")
+    refuse_full(out)
+    # No frame of a simulated bench may reach the configured bus.
+    bus = replace(plan.config.bus, interface="virtual", channel="lockstep", options={})
+    plan = plan.with_config(plan.config.model_copy(update={"bus": bus}))
+    with stoppable() as stop, status_line(plan.config.duration_s) as watch:
+        ended = with_bench(
+            plan, bench_config, out, RunControl(stop=stop, watch=watch), lockstep=True
+        )
+        text = keep_summary(ended, out)
+    if as_json:
+        typer.echo(text, nl=False)
+        refuse_bad_end(plan, ended)
+        return
+    print_end(plan, ended, out, diagnosis_of(plan, out), with_timing=False)

@@ -56,7 +56,14 @@ def diagnose(
     print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
         print_text(f"Printed: {out}/report.pdf")
-    if result.diagnosis.effects or result.diagnosis.linear:
+    if result.diagnosis.verdict == "partly_explained":
+        others = "".join(f" --held-out {path}" for path in held_out or [])
+        print_text(
+            "More is missing: diagnose once more what the corrected model lacks, by `rig diagnose "
+            f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
+        )
+    is_driven = result.diagnosis.held_out.strut_force_rmse_n is None
+    if is_driven and (result.diagnosis.effects or result.diagnosis.linear):
         print_text(
             f"Next: `rig run CONFIG --model {out}/corrected.yaml --listen-only --duration-s 20 "
             f"--out second`, then `rig tune CONFIG --model {out}/corrected.yaml --run second "

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.terminal import EXIT_CODES, print_text
+from rig.cli.terminal import EXIT_CODES, JsonFlag, print_json, print_text
 
 EXAMPLES = "Example: `rig docs guide`, then open guide/index.html"
 
@@ -14,13 +14,18 @@ EXAMPLES = "Example: `rig docs guide`, then open guide/index.html"
 def docs(
     context: typer.Context,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder of the site.")],
+    as_json: JsonFlag = False,
 ) -> None:
     """Build the guide as a web site that works without a network."""
     from rig.guide.reference import generated_blocks
     from rig.guide.site import build_site
 
     blocks = generated_blocks(lambda: "\n\n".join(_commands(context.parent)), EXIT_CODES)
-    print_text(f"Written: {build_site(folder, blocks)}")
+    index = build_site(folder, blocks)
+    if as_json:
+        print_json({"written": str(index)})
+    else:
+        print_text(f"Written: {index}")
 
 
 def _commands(parent: Any, prefix: str = "rig") -> Iterator[str]:

@@ -4,10 +4,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_bar
-from rig.cli.terminal import console, print_text
+from rig.cli.terminal import JsonFlag, print_json, print_text
 
 EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
@@ -53,6 +54,7 @@ def export_command(
             help="With --fmu: export the whole bench, of one guided degree of freedom.",
         ),
     ] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Export a run or a model to other programs.
 
@@ -69,14 +71,17 @@ def export_command(
     if fmu:
         if bench and strut is not None:
             raise InputError("--bench and --strut: expected one of them")
-        _export_model(source, out, fmi, strut, bench)
+        _export_model(source, out, fmi, strut, bench, as_json=as_json)
         return
     if bench or strut is not None:
         raise InputError("--bench and --strut: expected --fmu with them")
     from rig.log.checksums import find_damage, refuse_damage
 
-    for path in _export_run(source, kind or "", out, smoothed):
-        print_text(f"Written: {path}")
+    written = [str(path) for path in _export_run(source, kind or "", out, smoothed)]
+    if as_json:
+        print_json({"written": written})
+    else:
+        print_text("\n".join(f"Written: {path}" for path in written))
     refuse_damage(source, find_damage(source))
 
 
@@ -91,17 +96,23 @@ def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path
         return export_run(source, kind, out, lambda run: read_with_smoothed_forces(run, bar))
 
 
-def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: bool) -> None:
+def _export_model(
+    source: Path, out: Path, fmi: str, strut: str | None, bench: bool, *, as_json: bool
+) -> None:
     from dart_model.spec import load_model
     from rig.fmu.export import export_fmu
 
     spec = load_model(source)
-    with console.status("compiling") as status:
+    with Console(stderr=True).status("compiling") as status:
         component = export_fmu(
             spec, out, fmi, strut, bench, lambda target: status.update(f"{target} compiled")
         )
+    kinds = ("input", "state", "output")
+    names = {f"{kind}s": [item.name for _, item in component.of(kind)] for kind in kinds}
+    if as_json:
+        print_json({"written": [str(out)], "meaning": component.meaning, **names})
+        return
     print_text(component.meaning)
-    for kind in ("input", "state", "output"):
-        names = [item.name for _, item in component.of(kind)]
-        print_text(f"{kind}s: {', '.join(names) or 'none'}")
+    for kind, of_kind in names.items():
+        print_text(f"{kind}: {', '.join(of_kind) or 'none'}")
     print_text(f"Written: {out}")

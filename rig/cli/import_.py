@@ -1,5 +1,6 @@
 """`rig import`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -7,7 +8,7 @@ import typer
 
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_line
-from rig.cli.terminal import WRONG_INPUT, console, print_text
+from rig.cli.terminal import WRONG_INPUT, JsonFlag, console, print_json, print_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,6 +69,7 @@ def import_command(
     mass_kg: Annotated[
         float | None, typer.Option(metavar="KG", help="With --fmu: mass that the strut carries.")
     ] = None,
+    as_json: JsonFlag = False,
 ) -> None:
     """Import a foreign table as CSV, a bus log or an export as a run, an FMU as a model.
 
@@ -79,27 +81,37 @@ def import_command(
     if fmu:
         if config is not None or rebound is not None:
             raise InputError("--config and --rebound: expected none of them with --fmu")
-        _import_model(source, mapping, mass_kg, out)
+        _import_model(source, mapping, mass_kg, out, as_json=as_json)
         return
     if mass_kg is not None:
         raise InputError("--mass-kg: expected --fmu with it")
     if sum(option is not None for option in (mapping, config, rebound)) > 1:
         raise InputError("--mapping, --config and --rebound: expected one of them")
     if config is not None:
-        _import_bus_log(source, config, out)
+        _import_bus_log(source, config, out, as_json=as_json)
     elif mapping is not None or rebound is not None:
-        _import_tables(source, _mapping_finder(mapping, rebound or ""), out)
+        _import_tables(source, _mapping_finder(mapping, rebound or ""), out, as_json=as_json)
     else:
         from rig.formats.export import import_run
 
         import_run(source, out)
-        print_text(f"Run: {out}")
+        if as_json:
+            print_json({"run": str(out)})
+        else:
+            print_text(f"Run: {out}")
 
 
-def _import_model(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> None:
+def _import_model(
+    source: Path, mapping: Path | None, mass_kg: float | None, out: Path, *, as_json: bool
+) -> None:
     from rig.fmu.import_fmu import MODEL_FILE, import_fmu, variables_of
 
     roles = import_fmu(source, mapping, mass_kg, out).struts[0].fmu
+    if as_json:
+        variables = {} if roles is None else variables_of(roles)
+        carried_kg = None if roles is None or roles.acceleration is None else roles.mass_kg
+        print_json({"model": str(out / MODEL_FILE), "variables": variables, "mass_kg": carried_kg})
+        return
     if roles is not None:
         for role, variable in variables_of(roles).items():
             print_text(f"{role}: {variable}")
@@ -108,12 +120,13 @@ def _import_model(source: Path, mapping: Path | None, mass_kg: float | None, out
     print_text(f"Model: {out / MODEL_FILE}")
 
 
-def _import_bus_log(source: Path, config: Path, out: Path) -> None:
+def _import_bus_log(source: Path, config: Path, out: Path, *, as_json: bool) -> None:
     from rig.formats.bus_log import import_log
     from rig.plan.load import load_plan
 
     with progress_line(None) as progress:
-        _print_report(import_log(source, load_plan(config), out, progress))
+        report = import_log(source, load_plan(config), out, progress)
+    _print_report(report, as_json=as_json)
 
 
 def _mapping_finder(mapping: Path | None, rebound: str) -> "Callable[[Path], TableMapping]":
@@ -128,26 +141,46 @@ def _mapping_finder(mapping: Path | None, rebound: str) -> "Callable[[Path], Tab
     return lambda _: loaded
 
 
-def _import_tables(source: Path, find_mapping: "Callable[[Path], TableMapping]", out: Path) -> None:
+def _import_tables(
+    source: Path,
+    find_mapping: "Callable[[Path], TableMapping]",
+    out: Path,
+    *,
+    as_json: bool,
+) -> None:
     """Import a table, or every table of a folder; exit code 2 if one of these is refused."""
     from rig.formats.foreign_table import import_folder, import_table
 
     if not source.is_dir():
-        _print_report(import_table(source, find_mapping(source), out))
+        _print_report(import_table(source, find_mapping(source), out), as_json=as_json)
         return
-    refused = 0
+    refused: list[str] = []
+    imported: list[dict[str, object]] = []
     for path, result in import_folder(source, find_mapping, out):
         if isinstance(result, InputError):
-            refused += 1
-            print_text(f"refused: {result}", style="red")
+            refused.append(str(result))
+            if not as_json:
+                print_text(f"refused: {result}", style="red")
         else:
-            print_text(f"{path.name}: {result.samples} samples, {result.out}")
+            imported.append(_as_dict(result))
+            if not as_json:
+                print_text(f"{path.name}: {result.samples} samples, {result.out}")
+    if as_json:
+        print_json({"imported": imported, "refused": refused})
+    elif refused:
+        print_text(f"{len(refused)} refused, the others are in {out}")
     if refused:
-        print_text(f"{refused} refused, the others are in {out}")
         raise typer.Exit(WRONG_INPUT)
 
 
-def _print_report(report: "ImportReport") -> None:
+def _as_dict(report: "ImportReport") -> dict[str, object]:
+    return {**asdict(report), "out": str(report.out)}
+
+
+def _print_report(report: "ImportReport", *, as_json: bool) -> None:
+    if as_json:
+        print_json(_as_dict(report))
+        return
     console.print(
         f"{report.samples} samples, {report.duration_s:.3f} s at {report.rate_hz:g} a second: "
         f"{', '.join(report.columns)}"

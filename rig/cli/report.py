@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import RunFolder, print_text
+from rig.cli.terminal import JsonFlag, RunFolder, print_json, print_text
 
 EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
 
@@ -20,6 +20,7 @@ def report(
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Also write it as PDF; requires Chromium, Chrome or Edge.")
     ] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Write a report of a run as one HTML file: configuration, errors, timing, faults."""
     from rig.log.checksums import refuse_damage
@@ -34,8 +35,12 @@ def report(
         if existing.exists():
             raise InputError(f"{existing}: exists, expected another name (--out)")
     damage = write_run_report(run, path)
-    print_text(f"Written: {path}")
     if pdf:
         print_page(path, paper)
-        print_text(f"Printed: {paper}")
+    if as_json:
+        print_json({"report": str(path), "pdf": str(paper) if pdf else None})
+    else:
+        print_text(f"Written: {path}")
+        if pdf:
+            print_text(f"Printed: {paper}")
     refuse_damage(run, damage)

@@ -1,24 +1,17 @@
 """`rig run`."""
 
-import contextlib
-import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from can_dbc.errors import InputError
+from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end, refuse_bad_end
 from rig.cli.progress import status_line, stoppable
-from rig.cli.result_tables import print_run
 from rig.cli.side_by_side import run_side_by_side
-from rig.cli.terminal import FAILED, JsonFlag, print_text
+from rig.cli.terminal import JsonFlag
 from rig.files.folders import refuse_full
-
-if TYPE_CHECKING:
-    from rig.plan.plan import Plan
-    from rig.run.logged_run import Ended
 
 EXAMPLES = (
     "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only` · "
@@ -113,49 +106,12 @@ def _run_one(
             trace=Trace(plan.period_ns) if trace else None,
         )
         # Inside: a second Ctrl-C must not lose it.
-        text = json.dumps(ended.summary(), indent=2) + "\n"
-        with contextlib.suppress(OSError):  # a full disk, which the table below reports
-            (folder / "summary.json").write_text(text, "utf-8")
+        text = keep_summary(ended, folder)
     if as_json:
         typer.echo(text, nl=False)
-    else:
-        print_run(ended, with_timing=True)
-        print_text(f"Run: {folder}")
-    _refuse_bad_ends(plan, ended)
-    if not as_json and listen_only:
-        print_text(f"Next: `rig tune {config} --run {folder} --out tuned.yaml`")
-    elif not as_json and plan.has_force:
-        print_text(f"Next: `rig diagnose {folder} --model {folder}/model.yaml --out diagnosis`")
-
-
-def _why(ended: "Ended") -> str:
-    """Why a run is in its safe state, in brackets."""
-    cause = ended.state.supervised.cause
-    if cause is None:
-        return ""
-    value = f", {cause.quantity} {cause.value:.4g} beyond {cause.limit:.4g}" * bool(cause.quantity)
-    return f" ({cause.event.value}{value}; events.jsonl has what led there)"
-
-
-def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
-    from rig.bridge.values import Mode
-
-    stderr = Console(stderr=True)
-    if ended.state.mode is Mode.WAITING:
-        messages = sorted({entry.message for entry in plan.config.signals.height.values()})
-        stderr.print(
-            f"No valid height arrived: expected frames of {', '.join(messages)}. Is the bench "
-            "sending, are channel, bit rate and DBC right, and which frames were refused?",
-            style="red",
-        )
-        raise typer.Exit(FAILED)
-    if ended.state.mode is Mode.SAFE:
-        stderr.print(f"The run ended in its safe state{_why(ended)}.", style="red")
-        raise typer.Exit(FAILED)
-    if ended.dropped_steps:
-        stderr.print(
-            f"The log lacks {ended.dropped_steps} ticks ({ended.log_fault}): expected a disk with "
-            "room, and fast enough.",
-            style="red",
-        )
-        raise typer.Exit(FAILED)
+        refuse_bad_end(plan, ended)
+        return
+    following = diagnosis_of(plan, folder)
+    if listen_only:
+        following = f"rig tune {config} --run {folder} --out tuned.yaml"
+    print_end(plan, ended, folder, following, with_timing=True)

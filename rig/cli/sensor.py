@@ -147,6 +147,7 @@ def set_command(
     interface: Interface = "socketcan",
     channel: Channel = "can0",
     bitrate: Bitrate = 500_000,
+    as_json: JsonFlag = False,
 ) -> None:
     """Set a CANopen sensor's cycle and heartbeat and start it; or undo these changes.
 
@@ -165,7 +166,10 @@ def set_command(
         changes = read_undo(restore_from)
         with closing(CanOpenNetwork(config)) as network:
             restore(network, changes)
-        console.print(f"Restored: {len(changes)} objects, from {restore_from}.")
+        if as_json:
+            print_json({"restored": len(changes), "file": str(restore_from)})
+        else:
+            print_text(f"Restored: {len(changes)} objects, from {restore_from}.")
         return
     if node_id is None:
         raise InputError("rig sensor set: expected NODE, or --restore FILE")
@@ -173,11 +177,15 @@ def set_command(
         raise InputError("--sync also requires --cycle-ms")
     undo = before or Path(f"sensor-{node_id}-before.yaml")
     with closing(CanOpenNetwork(config)) as network:
-        if new:
-            identity = give_node_id(network, node_id)
-            print_text(f"Node id {node_id} given to {_identity_text(identity)}.")
+        named = _identity_text(give_node_id(network, node_id)) if new else None
+        if named is not None and not as_json:
+            print_text(f"Node id {node_id} given to {named}.")
         settings = CanOpenSettings(cycle_ms, sync, heartbeat_ms)
         changes = configure_with_undo(network, node_id, settings, undo)
+    if as_json:
+        file = str(undo) if changes else None
+        print_json({"node_id": node_id, "changed": len(changes), "undo": file, "device": named})
+        return
     changed = "no object had to be changed."
     if changes:
         changed = f"{len(changes)} objects changed. `rig sensor set --restore {undo}` undoes it."

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import console
+from rig.cli.terminal import JsonFlag, print_json, print_text
 
 EXAMPLES = (
     "Examples: `rig set runs/7 observers.strut.proportional_n_per_m=2e5` · "
@@ -33,6 +33,7 @@ def set_command(
     force: Annotated[
         bool, typer.Option("--force", help="Apply the change although `rig check` finds an error.")
     ] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Change gains or limits of a run in progress, acknowledge its safe state, or arm it."""
     from rig.run.change_requests import ask
@@ -48,7 +49,14 @@ def set_command(
         raise InputError(f"{' and '.join(named)}: expected one of them")
     if requests:
         ask(run, {"request": requests[0], "by": user_name()})
-        console.print(f"Requested: {requests[0]}.")
+        if as_json:
+            print_json({"requested": requests[0]})
+        else:
+            print_text(f"Requested: {requests[0]}.")
         return
     found = ask(run, {"set": parse_assignments(assignments or ())}, force=force)
-    console.print(f"Changed from {found.get('t_ns', 0) * 1e-9:.3f} s on.")
+    since_s = found.get("t_ns", 0) * 1e-9
+    if as_json:
+        print_json({"changed_from_s": since_s})
+    else:
+        print_text(f"Changed from {since_s:.3f} s on.")

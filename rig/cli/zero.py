@@ -78,7 +78,8 @@ def zero_command(
         found = find_zero(readings, length_m, before, is_remounted=is_remounted)
     write_mounting(plan, channel, found)
     if as_json:
-        print_json({"channel": channel.key, **readings._asdict(), **found.keys})
+        scale = {} if found.scale is None else {"scale": found.scale}
+        print_json({"channel": channel.key, **readings._asdict(), **found.keys, **scale})
         return
     _print(config, channel, readings, found)
 
@@ -121,8 +122,13 @@ def _print(config: Path, channel: "Channel", readings: "Readings", found: "Mount
     )
     for key, value in found.keys.items():
         print_text(f"{channel.key}.{key}: {value}")
+    if found.scale is not None:
+        print_text(
+            f"Over the two lengths the reading changed {abs(found.scale):.4g} times as much as the "
+            "length: 1 but for the errors of the rule, or the scale in the DBC is wrong"
+        )
     print_text(f"Written: {config}")
-    if is_length and not found.is_direction_known:
+    if is_length and found.scale is None:
         print_text(
             "The direction is not known yet: bring the strut to another length and run "
             f"`rig zero {config} --strut {channel.name} --length-m LENGTH` again."

@@ -57,6 +57,9 @@ run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integ
 _HOLD = 0.3
 """Share of half a sampling interval within which a delay may be that of a zero-order hold."""
 
+_FRICTION_LIKE = 0.2
+"""Share of a damper law's RMS that differs from dry friction, below which it acts as that."""
+
 
 class FitEstimates(NamedTuple):
     """A fit with its covariance, from which estimates with confidence intervals follow."""
@@ -117,7 +120,8 @@ def compose_result(
             is_white(problem, search.given, criteria.white),
             is_white(problem, chosen, criteria.white),
         ),
-        _notes(problem, search, by_blocks=by_blocks),
+        _notes(problem, search, by_blocks=by_blocks)
+        + _notes_of_friction_like_laws(problem, chosen, after),
         tuple(grid.name for grid in problem.grids),
         problem.spec.name,
     )
@@ -374,6 +378,39 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "the initial states are those of the fit."
         )
     return tuple(notes)
+
+
+def _notes_of_friction_like_laws(
+    problem: Problem, result: Fit, after: Sequence[ResidualForces | None]
+) -> tuple[str, ...]:
+    """Laws of dampers whose force is that of dry friction along the recordings."""
+    candidate = result.candidate
+    names = [problem.existing[index].name for index in candidate.kept]
+    names += [name for _, name in candidate.new]
+    tracks = [(k, forces.track) for k, forces in enumerate(after) if forces is not None]
+    if not tracks:
+        return ()
+    notes: list[str] = []
+    for name, (strut, force) in zip(
+        names, forces_along(problem, result.model, tracks), strict=True
+    ):
+        velocity = np.concatenate([track.velocities_m_per_s[strut] for _, track in tracks])
+        friction_n = find_friction_n(force, velocity)
+        if effect(name).family == "nonlinear_damping" and friction_n is not None:
+            notes.append(
+                f"{name} of strut {problem.spec.struts[strut].name} acts as dry friction of "
+                f"{friction_n:.3g} N along these runs: its knee is below nearly all speeds."
+            )
+    return tuple(notes)
+
+
+def find_friction_n(force_n: Array, velocity_m_per_s: Array) -> float | None:
+    """Dry friction in N that a force is along a motion, both of shape (n,); None if it is none."""
+    direction = np.sign(velocity_m_per_s)
+    friction_n = -float(np.mean(force_n * direction))
+    if friction_n <= 0.0 or rms(force_n + friction_n * direction) > _FRICTION_LIKE * rms(force_n):
+        return None
+    return friction_n
 
 
 def _resembles_hold(problem: Problem, result: Fit) -> bool:

@@ -135,9 +135,7 @@ def _check_comparison(row: Limit, where: str, struts: Sequence[str], can_compare
         )
 
 
-def _check_std(
-    row: Limit, where: str, struts: Sequence[str], without_std: Collection[str]
-) -> None:
+def _check_std(row: Limit, where: str, struts: Sequence[str], without_std: Collection[str]) -> None:
     """Refuse a limit on a standard deviation that an observer does not know."""
     for strut in struts:
         if strut in without_std and row.strut in (None, strut):

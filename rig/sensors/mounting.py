@@ -27,7 +27,7 @@ _LEAST_CHANGE_M = 5e-3
 """Between two lengths from which direction and scale are determined: a length read off a steel
 rule errs by half a millimetre."""
 
-_GAIN_TOLERANCE = 0.2
+_SCALE_TOLERANCE = 0.2
 """Largest deviation of the scale from 1: two lengths that are 5 mm apart and err by half a
 millimetre each show it as well as this."""
 
@@ -131,10 +131,16 @@ def summarise(t_s: Array, values: Array) -> Readings:
 
 
 class Mounting(NamedTuple):
-    """What was found of a sensor, and whether its direction is known by two lengths."""
+    """What was found of a sensor.
+
+    Attributes:
+        keys: What is written into its entry of the configuration.
+        scale: Change of its reading over that of the length, by two lengths, dimensionless and
+            negative for a reversed sensor; None while one length is known.
+    """
 
     keys: dict[str, object]
-    is_direction_known: bool
+    scale: float | None = None
 
 
 def find_zero(
@@ -156,31 +162,30 @@ def find_zero(
         )
     zero: dict[str, object] = {"reads": round(readings.mean, 7), "at_m": length_m}
     last = None if is_remounted else before.zero
-    gain = None if last is None else _gain(readings.mean, length_m, last)
-    if gain is None:
-        return Mounting({"zero": zero, "reversed": before.reversed}, is_direction_known=False)
-    return Mounting({"zero": zero, "reversed": gain < 0.0}, is_direction_known=True)
+    scale = None if last is None else _scale(readings.mean, length_m, last)
+    is_reversed = before.reversed if scale is None else scale < 0.0
+    return Mounting({"zero": zero, "reversed": is_reversed}, scale)
 
 
-def _gain(reads: float, length_m: float, last: Zero) -> float | None:
+def _scale(reads: float, length_m: float, last: Zero) -> float | None:
     """Change of the reading over that of the length; None between lengths too near."""
     change_m = length_m - last.at_m
     if abs(change_m) < _LEAST_CHANGE_M:
         return None
-    gain = (reads - last.reads) / change_m
-    if abs(abs(gain) - 1.0) > _GAIN_TOLERANCE:
+    scale = (reads - last.reads) / change_m
+    if abs(abs(scale) - 1.0) > _SCALE_TOLERANCE:
         raise InputError(
             f"the reading changed by {(reads - last.reads) * 1e3:.4g} mm from a length of "
             f"{last.at_m * 1e3:g} mm to {length_m * 1e3:g} mm, expected {abs(change_m) * 1e3:.4g} "
             "mm up or down: a length is wrong, or the unit or scale in the DBC; --remounted if "
             "the sensor was moved since"
         )
-    return gain
+    return scale
 
 
 def find_tare(readings: Readings) -> Mounting:
     """The tare of a force's sensor that nothing pulls or pushes."""
-    return Mounting({"tare_n": round(readings.mean, 4)}, is_direction_known=False)
+    return Mounting({"tare_n": round(readings.mean, 4)})
 
 
 def write_mounting(plan: Plan, channel: Channel, mounting: Mounting) -> None:

@@ -35,17 +35,18 @@ SHORTEST_GRID_NS = 10_000
 
 
 class _Channel(NamedTuple):
-    """One measured quantity: its column of a record, its noise and the noise's source."""
+    """One measured quantity: its column of a record, its offset, its noise and its source."""
 
     signal: str
     dimension: Dimension
     column: int
+    offset: float
     noise_std: float
     noise: np.random.Generator
 
     def measure(self, record: list[float]) -> float:
-        """The quantity, with noise."""
-        value = record[self.column]
+        """The quantity, with offset and noise."""
+        value = record[self.column] + self.offset
         if self.noise_std > 0.0:
             value += self.noise_std * self.noise.standard_normal()
         return value
@@ -212,7 +213,8 @@ def _channels(
         if sensor is not None:
             is_of_strut = isinstance(sensor, HeightSensor | LoadCell)
             first = RECORD_COLUMNS * struts.index(sensor.strut) if is_of_strut else 0
+            at = first + column
             channels.append(
-                _Channel(sensor.signal, dimension, first + column, sensor.noise_std, noise)
+                _Channel(sensor.signal, dimension, at, sensor.offset, sensor.noise_std, noise)
             )
     return channels

@@ -368,6 +368,11 @@ class _Sensor(_Section):
     signal: str
 
     @property
+    def offset(self) -> float:
+        """What the sensor reads at zero, in its unit."""
+        return 0.0
+
+    @property
     def noise_std(self) -> float:
         """Standard deviation of the noise in the sensor's unit."""
         *_, (_, value) = self
@@ -379,21 +384,35 @@ class HeightSensor(_Sensor):
 
     Attributes:
         strut: Strut whose height it measures.
+        offset_m: Reading at a height of zero, in m, as of a draw-wire with an arbitrary zero.
         noise_std_m: Standard deviation of white noise in m.
     """
 
     strut: Name
+    offset_m: float = 0.0
     noise_std_m: NotNegative = 0.0
+
+    @property
+    def offset(self) -> float:
+        """What it reads above the height, in m."""
+        return self.offset_m
 
 
 class AppliedForceSensor(_Sensor):
     """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise.
 
     Attributes:
+        offset_n: Reading without a force, in N.
         noise_std_n: Standard deviation of white noise in N.
     """
 
+    offset_n: float = 0.0
     noise_std_n: NotNegative = 0.0
+
+    @property
+    def offset(self) -> float:
+        """What it reads without a force, in N."""
+        return self.offset_n
 
 
 class LoadCell(_Sensor):
@@ -401,11 +420,18 @@ class LoadCell(_Sensor):
 
     Attributes:
         strut: Strut whose force it measures.
+        offset_n: Reading without a force, in N.
         noise_std_n: Standard deviation of white noise in N.
     """
 
     strut: Name
+    offset_n: float = 0.0
     noise_std_n: NotNegative = 0.0
+
+    @property
+    def offset(self) -> float:
+        """What it reads without a force, in N."""
+        return self.offset_n
 
 
 class Thermometer(_Sensor):

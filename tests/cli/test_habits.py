@@ -6,11 +6,12 @@ import sys
 from xml.etree import ElementTree
 
 import pytest
+import typer
 import yaml
 
 from rig.bridge.counts import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
-from rig.cli.main import main
+from rig.cli.main import app, main
 from rig.cli.progress import status_line
 from rig.cli.terminal import console, table
 from rig.plan.config import CONFIGS
@@ -64,6 +65,56 @@ def test_what_fails_a_check_fails_its_test_case(monkeypatch, capsys, tmp_path):
         if case.find("failure") is not None
     }
     assert failed == {item["what"] for item in findings if item["severity"] == "error"} != set()
+
+
+def commands_of(group, prefix="rig"):
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands_of(command, f"{prefix} {name}")
+        else:
+            yield f"{prefix} {name}", command
+
+
+def test_every_command_that_prints_a_result_prints_it_as_json():
+    without = {
+        name
+        for name, command in commands_of(typer.main.get_command(app))
+        if not any("--json" in parameter.opts for parameter in command.params)
+    }
+    # It serves pages until Ctrl-C.
+    assert without == {"rig view"}
+
+
+def test_a_report_an_export_and_an_import_as_json(monkeypatch, capsys, tmp_path):
+    make_run(tmp_path / "run", 200)
+
+    def found(*arguments):
+        assert rig(monkeypatch, *arguments, "--json") == 0
+        return json.loads(capsys.readouterr().out)
+
+    run, table_file = tmp_path / "run", tmp_path / "run.csv"
+    page = str(run / "report.html")
+    assert found("report", run) == {"report": page, "pdf": None}
+    archive = tmp_path / "run.mf4"
+    assert found("export", run, "--format", "mf4", "--out", archive) == {"written": [str(archive)]}
+    assert found("import", archive, "--out", tmp_path / "again") == {"run": str(tmp_path / "again")}
+    table_file.write_text("t;z;f\n" + "".join(f"{k};{k % 7};{k % 5}\n" for k in range(200)))
+    mapping = {
+        "table": {"separator": ";"},
+        "time": {"column": "t", "unit": "ms"},
+        "height": {"column": "z", "unit": "mm", "zero": {"reads": 0.0, "at_m": 0.3}},
+        "strut_force": {"column": "f", "unit": "N"},
+    }
+    (tmp_path / "mapping.yaml").write_text(yaml.safe_dump(mapping))
+    out = tmp_path / "table.csv"
+    report = found("import", table_file, "--mapping", tmp_path / "mapping.yaml", "--out", out)
+    assert (report["out"], report["samples"]) == (str(out), 200)
+    assert report["columns"] == ["t_s", "height_m", "strut_force_n"]
+    unit = tmp_path / "strut.fmu"
+    model = run / "model.yaml"
+    exported = found("export", model, "--fmu", "--out", unit)
+    assert exported["written"] == [str(unit)]
+    assert exported["inputs"]
 
 
 def test_a_replay_as_json(monkeypatch, capsys, tmp_path):

@@ -274,3 +274,20 @@ def test_a_value_that_is_no_number_is_one_line(name, old, new, tmp_path):
     with pytest.raises(ModelError, match="expected") as caught:
         DartPlant(model(tmp_path, f"{{file: {name}}}"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ('mass value="10"', 'mass value="ten"', "mass [ten] is not a float"),
+        ("</robot>", "", "XML_ERROR"),
+        ('<child link="body"/>', '<child link="bodi"/>', "child link [bodi] of joint"),
+    ],
+)
+def test_the_parsers_reason_is_in_the_line_and_not_beside_it(old, new, reason, tmp_path, capfd):
+    assert old in URDF
+    (tmp_path / "bench.urdf").write_text(URDF.replace(old, new), "utf-8")
+    with pytest.raises(ModelError) as caught:
+        DartPlant(model(tmp_path, "{file: bench.urdf}"))
+    assert reason in str(caught.value)
+    assert capfd.readouterr().err == ""

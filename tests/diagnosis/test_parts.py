@@ -11,6 +11,7 @@ from rig.diagnosis.problem.build import build, part_of, with_tones
 from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
 from rig.diagnosis.problem.track import largest_stride, pieces
 from rig.diagnosis.search.fit import fit
+from rig.diagnosis.write_up import find_friction_n
 from tests.diagnosis import little_bench, little_dyno
 
 
@@ -128,3 +129,17 @@ def test_short_recordings_are_searched_whole():
     problem = build(little_bench.model(), [little_bench.run(little_bench.Nothing())], 32, None)
     assert part_of(problem, problem.fit_nodes(0).size) is problem
     assert part_of(problem, problem.fit_nodes(0).size // 2 + 1) is problem
+
+
+def test_a_damper_whose_knee_is_below_all_speeds_is_dry_friction():
+    velocity = 0.3 * np.sin(np.linspace(0.0, 40.0, 4001))
+
+    def digressive(knee_m_per_s):
+        return -28.0 * np.tanh(velocity / knee_m_per_s)
+
+    assert find_friction_n(digressive(0.003), velocity) == pytest.approx(28.0, rel=0.02)
+    assert find_friction_n(digressive(0.3), velocity) is None
+    assert find_friction_n(-900.0 * velocity, velocity) is None
+    # Friction drives nothing.
+    assert find_friction_n(-digressive(0.003), velocity) is None
+    assert find_friction_n(np.zeros(4), np.zeros(4)) is None

@@ -136,7 +136,7 @@ def test_a_limit_on_a_standard_deviation_needs_an_observer_that_knows_it():
             without_std=["rear"],
         ).struts
 
-    with pytest.raises(InputError, match=r"limits\.0\.value: force_std_n: observers\.rear does not"):
+    with pytest.raises(InputError, match=r"0\.value: force_std_n: observers\.rear does not"):
         of_two(own)
     front = row(value="force_std_n", high=100.0, strut="front")
     assert front in of_two(front)[0]

@@ -73,6 +73,7 @@ def test_two_lengths_give_zero_direction_and_scale(tmp_path, runs):
     read = json.loads(found.output)
     assert read["samples"] > 900
     assert read["std"] == pytest.approx(NOISE_M, rel=0.1)
+    assert read["scale"] == pytest.approx(-1.0, abs=1e-4)
     entry = yaml.safe_load(path.read_text())["signals"]["height"]
     # 450 mm less the length, of which a mean of a thousand errs by a micrometre.
     assert entry["zero"]["at_m"] == 0.30
@@ -87,6 +88,7 @@ def test_the_first_length_says_that_the_direction_is_not_known(tmp_path, runs):
     found = zero(path, "--length-m", 0.36, "--run", runs[0.36])
     assert "The direction is not known yet" in found.output
     again = zero(path, "--length-m", 0.30, "--run", runs[0.30])
+    assert "the reading changed 1 times as much" in " ".join(again.output.split())
     assert "Next: `rig check" in again.output
     assert yaml.safe_load(path.read_text())["signals"]["height"]["reversed"] is False
 
@@ -157,4 +159,4 @@ def test_lengths_that_are_near_leave_the_direction_as_it_was(change_m):
     readings = Readings(100, 1.0, 0.2 + 0.5 * change_m, 0.0, 0.0, 0.0)
     found = find_zero(readings, 0.4 + change_m, before, is_remounted=False)
     assert found.keys["reversed"] is True
-    assert not found.is_direction_known
+    assert found.scale is None

@@ -1,0 +1,80 @@
+"""The end of a run on the terminal: summary, table, exit code, the next command."""
+
+import contextlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+
+from rig.cli.result_tables import print_run
+from rig.cli.terminal import FAILED, print_text
+
+if TYPE_CHECKING:
+    from rig.plan.plan import Plan
+    from rig.run.logged_run import Ended
+
+
+def keep_summary(ended: "Ended", folder: Path) -> str:
+    """Write `summary.json` into a run's folder; returns its text."""
+    text = json.dumps(ended.summary(), indent=2) + "\n"
+    with contextlib.suppress(OSError):  # a full disk, which the table reports
+        (folder / "summary.json").write_text(text, "utf-8")
+    return text
+
+
+def print_end(
+    plan: "Plan", ended: "Ended", folder: Path, following: str, *, with_timing: bool
+) -> None:
+    """Print how a run ended, refuse a bad end with its exit code, and name what follows."""
+    print_run(ended, with_timing=with_timing)
+    print_text(f"Run: {folder}")
+    refuse_bad_end(plan, ended)
+    if following:
+        print_text(f"Next: `{following}`")
+
+
+def diagnosis_of(plan: "Plan", folder: Path) -> str:
+    """The command that diagnoses a run; empty where no force was measured."""
+    if not plan.has_force:
+        return ""
+    return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
+
+
+def refuse_bad_end(plan: "Plan", ended: "Ended") -> None:
+    """Exit with a message where a run ended in its safe state, without a height or without a log.
+
+    Raises:
+        Exit: It did.
+    """
+    from rig.bridge.values import Mode
+
+    stderr = Console(stderr=True)
+    if ended.state.mode is Mode.WAITING:
+        messages = sorted({entry.message for entry in plan.config.signals.height.values()})
+        stderr.print(
+            f"No valid height arrived: expected frames of {', '.join(messages)}. Is the bench "
+            "sending, are channel, bit rate and DBC right, and which frames were refused?",
+            style="red",
+        )
+        raise typer.Exit(FAILED)
+    if ended.state.mode is Mode.SAFE:
+        stderr.print(f"The run ended in its safe state{_why(ended)}.", style="red")
+        raise typer.Exit(FAILED)
+    if ended.dropped_steps:
+        stderr.print(
+            f"The log lacks {ended.dropped_steps} ticks ({ended.log_fault}): expected a disk with "
+            "room, and fast enough.",
+            style="red",
+        )
+        raise typer.Exit(FAILED)
+
+
+def _why(ended: "Ended") -> str:
+    """Why a run is in its safe state, in brackets."""
+    cause = ended.state.supervised.cause
+    if cause is None:
+        return ""
+    value = f", {cause.quantity} {cause.value:.4g} beyond {cause.limit:.4g}" * bool(cause.quantity)
+    return f" ({cause.event.value}{value}; events.jsonl has what led there)"
