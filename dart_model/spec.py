@@ -69,7 +69,7 @@ class JointSpec(_Frozen):
 
     Attributes:
         type: ``prismatic``, ``revolute``, ``ball`` or ``free``.
-        axis: Unit direction for prismatic and revolute joints (normalised here if it is not).
+        axis: Direction of a prismatic or revolute joint; its length does not matter.
         parent: Name of the parent body, or ``world``.
         offset_m: Origin of the joint in the parent's frame.
     """
@@ -92,8 +92,10 @@ class BodySpec(_Frozen):
     Attributes:
         name: Unique name.
         mass_kg: Mass.
-        joint: How it is connected to its parent.
-        inertia_kg_m2: Principal moments of inertia about the centre of mass, which is the origin.
+        joint: Joint between the body and its parent.
+        inertia_kg_m2: Principal moments of inertia about the centre of mass, which is the origin of
+            the body's frame. If absent, each moment has the numerical value of the mass (10 kg:
+            10 kg·m²): state them for every body that rotates.
     """
 
     name: Name
@@ -103,7 +105,11 @@ class BodySpec(_Frozen):
 
 
 class InlineSkeleton(_Frozen):
-    """Bodies given in the model file itself, parents before children."""
+    """Bodies given in the model file itself.
+
+    Attributes:
+        bodies: Rigid bodies, parents before children; required if there is no `file`.
+    """
 
     bodies: Annotated[tuple[BodySpec, ...], Field(min_length=1, max_length=256)]
 
@@ -123,7 +129,8 @@ class FileSkeleton(_Frozen):
     """Bodies given by a URDF, SDF, SKEL or MJCF file in the model file's folder.
 
     Attributes:
-        file: Its path, within that folder.
+        file: Path of a URDF, SDF, SKEL or MJCF file in the model file's folder; required if there
+            are no `bodies`.
     """
 
     file: InFolder
@@ -142,7 +149,7 @@ class EffectSpec(_Frozen):
 
     Attributes:
         name: Name of the effect in the catalogue.
-        parameters: Its parameters, by name; all of them.
+        parameters: Values of all parameters of the effect, by name.
     """
 
     name: str
@@ -182,15 +189,17 @@ class FmuSpec(_Frozen):
     """A functional mock-up unit that gives a strut's force, or stands for a whole guided bench.
 
     Attributes:
-        file: The FMU.
+        file: The FMU, in the model file's folder.
         height: Variable of the strut's height in m: an input or a state.
-        velocity: Variable of its derivative in m/s, positive in rebound: an input or a state.
-        force: Variable of the strut's force in N, positive where it pushes its bodies apart.
-        acceleration: Instead of it, of a bench: second derivative of the height in m/s².
-        mass_kg: Of a bench: mass that moves along the height.
-        temperature: Input of the damper temperature in °C.
-        applied_force: Input of the applied force in N.
-        parameters: Start values of its parameters.
+        velocity: Variable of the rate of the height in m/s, positive in rebound: an input or a
+            state.
+        force: Variable of the strut's force in N, positive when it pushes the ends apart.
+        acceleration: Instead of `force`, if the FMU models the whole bench: variable of the second
+            derivative of the height in m/s². Exactly one of the two is required.
+        mass_kg: Only with `acceleration`: mass that moves along the height.
+        temperature: Input variable for the damper temperature in °C.
+        applied_force: Input variable for the applied force in N.
+        parameters: Start values of the FMU's parameters, by name.
     """
 
     file: InFolder
@@ -215,13 +224,16 @@ class StrutSpec(_Frozen):
 
     Attributes:
         name: Unique name.
-        between: Lower and upper body; ``world`` is a body.
-        free_length_m: Height at which the spring carries nothing.
+        between: Body at the lower and body at the upper end, in this order; either may be
+            ``world``.
+        free_length_m: Height at which the force of the spring is zero.
         stiffness_n_per_m: Linear stiffness.
         damping_n_s_per_m: Linear damping.
-        attachments_m: Where the strut is fixed, in the frame of each body.
-        effects: Laws besides spring and damper.
-        fmu: A further force, which a functional mock-up unit computes.
+        attachments_m: Attachment points at the lower and at the upper body, each in its body's
+            frame.
+        effects: Effects in addition to the linear spring and damper.
+        fmu: A functional mock-up unit (FMU) that computes an additional force in the strut, or
+            (with `acceleration`) replaces the whole guided bench.
     """
 
     name: Name
@@ -241,17 +253,20 @@ class StrutSpec(_Frozen):
 
 
 class ModelTolerance(_Frozen):
-    """Prior deviation of the bench from the model's numbers: one standard deviation each.
+    """Prior standard deviation of the bench's parameters from the model's values.
 
     A diagnosis uses it as prior of the linear corrections; a value that is not given has a default.
 
     Attributes:
-        mass_kg: Share of each mass.
-        stiffness_n_per_m: Share of each strut's stiffness.
-        damping_n_s_per_m: Share of each strut's damping.
-        preload_n: Constant force in each strut, in N.
-        input_gain: Share of the applied force.
-        free_length_m: Free length of each strut, in m.
+        mass_kg: Standard deviation of each mass, in percent; 5 % if absent.
+        stiffness_n_per_m: Standard deviation of each strut's stiffness, in percent; 20 % if absent.
+        damping_n_s_per_m: Standard deviation of each strut's damping, in percent; 40 % if absent.
+        preload_n: Standard deviation of a constant force in each strut, in N; if absent, a tenth of
+            the spring's change of force over the recorded stroke, or of the RMS of the residual
+            force if that is larger.
+        input_gain: Standard deviation of the gain of the applied force, in percent; 2 % if absent.
+        free_length_m: Standard deviation of each strut's free length, in m; if absent, a tenth of
+            the recorded stroke.
     """
 
     mass_kg: Share | None = None
@@ -267,11 +282,12 @@ class ModelSpec(_Frozen):
 
     Attributes:
         name: Name of the model.
-        gravity_m_per_s2: Standard gravity along -z.
-        skeleton: Bodies and joints, inline or in a file.
+        gravity_m_per_s2: Gravitational acceleration, in the direction of -z.
+        skeleton: Bodies and joints: either `bodies` or `file`.
         struts: Spring-dampers; one observer may act on each.
-        applied_force_body: Body on which the applied force acts; by default the last strut's upper.
-        tolerance: Prior deviation of the bench from these numbers, if it is known.
+        applied_force_body: Body on which the applied force acts; by default the upper body of the
+            last strut, or its lower body if the upper one is ``world``.
+        tolerance: Prior standard deviation of the bench's parameters from the values in this file.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """
 

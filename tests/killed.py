@@ -29,11 +29,11 @@ _COUNTS = struct.Struct("<qq")
 
 
 TEXT = """
-The reference case runs in real time in a process of its own, with its bench on a virtual bus in the
-same process. It counts the frames and ticks that it received in memory that outlives it, before
-they are logged. It is killed (SIGKILL) at a random moment, 0.3 to 4 s after its first tick. What is
-on the disk is counted, and the run is replayed from its frames; ticks are different if the replay
-does not agree with the log bit by bit. A loss of power is not tested here.
+The reference case runs in real time, with its simulated bench on a virtual bus in the same process.
+Before frames and ticks are logged, the process counts them in memory that remains when it dies.
+The process is killed (SIGKILL) at a random moment, 0.3 to 4 s after its first tick. The frames and
+steps on the disk are then counted, and the run is replayed from its frames. A tick is different if
+the replay does not agree with the log bit for bit. A loss of power is not tested.
 """
 
 
@@ -91,12 +91,12 @@ def main() -> None:
     print(f"lost at most {worst}")
     if asked.page:
         heads = ("run", "frames received", "ticks", "frames on the disk", "steps on the disk")
-        counts = ("ticks replayed", "ticks different", "frames lost")
+        counts = ("ticks replayed", "different ticks", "frames lost")
         write_evidence(
             "killed",
-            "What a kill takes",
+            "What is lost when the process is killed",
             TEXT,
-            [f"At most {worst} were lost.", table((*heads, *counts), rows)],
+            [f"In one run, at most {worst} were lost.", table((*heads, *counts), rows)],
             command_line(),
         )
 

@@ -22,17 +22,18 @@ from tests.evidence import add_page_option, command_line, table, write_evidence
 
 FIGURES = (
     "largest height error, mm",
-    "force error, RMS, N",
-    "force error over the peak, %",
-    "force peak, N",
+    "force error (RMS), N",
+    "force error (RMS) relative to the peak, %",
+    "peak force, N",
 )
 TEXT = """
-The paper of the method gives no curves of its spring and damper. The curves of the shipped
-reference bench were chosen so that its figures (2.5 mm and 1.14 % of the peak force) are met. This
-page shows what other curves give: the slope of the spring's and of the damper's curve is
-multiplied, along the curve, by a smooth factor drawn between half and two. Observer and model stay
-those of the reference case. Each bench runs through CAN in lockstep for 20 s, and the first
-{settled_s:g} s are left out. Errors are those of the estimate against the simulated bench.
+The paper of the method does not give the curves of its spring and damper. Those of the shipped
+reference bench were chosen so that the published errors result (2.5 mm of height and 1.14 % of the
+peak force). This page shows the errors with other curves: the slopes of the spring curve and of the
+damper curve are multiplied by a smooth factor, drawn at random between 0.5 and 2. Observer and
+model are those of the reference case. Each bench runs over CAN in lockstep for 20 s; the first
+{settled_s:g} s are not evaluated. An error is the difference between the estimate and the simulated
+bench.
 """
 
 

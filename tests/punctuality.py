@@ -21,11 +21,15 @@ from rig.run.trace import read_trace
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
-The bridge and a loop that does nothing run in turn at 1 kHz, for the same time each, with the
-simulated bench in the bridge's process and a process on each core that is busy for {busy:g} % of
-the time. A tick is missed when the loop is late by its whole period. Only the two runs of one pair
-can be compared: hours differ more than programs do. The causes are those that `rig timing` computes
-from the kernel's accounting. SCHED_FIFO was {granted}.
+The bridge and an empty loop, which only waits for its ticks, run in turn at 1 kHz for equal times.
+The simulated bench runs in the bridge's process, and on each core a further process is busy for
+{busy:g} % of the time. SCHED_FIFO was {granted}. A tick is missed if the loop is late by a whole
+period.
+
+Only the two runs of one pair are comparable, because the load of the machine changes more over
+hours than the two loops differ. The lines below the totals give the missed ticks by the part of the
+loop in which the time was lost, and by its cause, as `rig timing` determines it from the kernel's
+accounting.
 """
 
 NAMES = {"bare": "empty loop", "bridge": "bridge"}
@@ -62,8 +66,8 @@ def write_page(rows: list[dict[str, tuple[int, Counter[str]]]], text: str, secon
     spread = [f"{m:g} ({a:g} to {b:g})" for a, m, b in zip(low, middle, high, strict=True)]
     total = causes["bare"] + causes["bridge"]
     cells = [
-        ("median (10 to 90 %)", *spread),
-        (f"in all {len(rows)}", *counts.sum(axis=0)),
+        ("median over the pairs (10 to 90 %)", *spread),
+        (f"sum over {len(rows)} pairs", *counts.sum(axis=0)),
         *(
             (f"- {cause}", *(causes[name][cause] for name in NAMES))
             for cause, _ in total.most_common()
@@ -76,7 +80,8 @@ def write_page(rows: list[dict[str, tuple[int, Counter[str]]]], text: str, secon
         text,
         [
             table((f"missed ticks of {seconds * 1000:g}", *NAMES.values()), cells),
-            f"Bridge less empty loop, median of the pairs: {difference} ticks.",
+            "Missed ticks of the bridge less those of the empty loop, median over the pairs: "
+            f"{difference}.",
         ],
         command_line(),
     )

@@ -45,12 +45,14 @@ CLASSIC_CAN_HZ = 3703
 MOST_ERROR = 0.02
 
 TEXT = """
-Bridge and simulated bench are in one process, on a virtual bus, in real time: one frame in and one
-frame out a tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
-Lateness is the time from a tick's deadline to the wake-up of the loop, work the time from there to
-the end of the tick. A missed tick is skipped and counted. The force error is the RMS difference to
-the simulated bench's load cell, over its peak. Lateness is the machine's as much as the program's:
-another one gives other figures, and no bus hardware is in these.
+Bridge and simulated bench run in one process, on a virtual bus, in real time: one frame in and one
+frame out per tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
+
+The lateness is the time from a tick's deadline to the wake-up of the loop; the work is the time
+from there to the end of the tick. A missed tick is counted and not made up for. The force error is
+the RMS difference to the simulated bench's load cell, relative to the peak force. The lateness
+depends on the machine as much as on the program, so that it differs on another machine. No CAN
+hardware took part.
 """
 
 _ROUND_NS = 20_000_000
@@ -146,7 +148,9 @@ def show(ended: Ended, rate_hz: float, error: float) -> None:
 def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error: float) -> None:
     """Write the guide's page."""
     granted = ended.granted is not None and ended.granted.fifo
-    load = f"A process on each core is busy for {100 * busy:g} % of the time." if busy else ""
+    load = (
+        f"On each core, a further process is busy for {100 * busy:g} % of the time." if busy else ""
+    )
     missed = ended.state.counts.overruns
     times = {"lateness": ended.timing.lateness_us(), "work": ended.timing.work_us()}
     rows = [(name, *(f"{value:.0f}" for value in found.values())) for name, found in times.items()]
@@ -162,8 +166,8 @@ def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error:
         ),
         [
             table(("time of a tick", *levels), rows),
-            f"Of {ended.ticks + missed} ticks {missed} were missed. The force error is "
-            f"{100 * error:.2f} % of the peak (RMS).",
+            f"Of {ended.ticks + missed} ticks, {missed} were missed. The force error (RMS) is "
+            f"{100 * error:.2f} % of the peak force.",
         ],
         command_line(),
     )

@@ -7,7 +7,7 @@ from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import Starts, grid, moving, within
 
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
-_FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
+_FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that remains")
 _LOSS = Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
 AMBIENT_C = 20.0
@@ -143,7 +143,7 @@ TIME_FADE = _fade(
     words="fade of the damper with time",
     parameters=(
         _FINAL,
-        Parameter("time_constant_s", "s", 1e-9, 1e12, "time in which the damper warms up"),
+        Parameter("time_constant_s", "s", 1e-9, 1e12, "time constant with which the damping falls"),
     ),
     force=_time,
     excitation="a long run with the same motion at its beginning and end",
@@ -157,7 +157,7 @@ ENERGY_FADE = _fade(
     words="fade of the damper with dissipated energy",
     parameters=(
         _FINAL,
-        Parameter("energy_j", "J", 1e-12, 1e12, "work in which the damper warms up"),
+        Parameter("energy_j", "J", 1e-12, 1e12, "dissipated energy with which the damping falls"),
     ),
     force=_energy,
     excitation="a long run with the same motion at its beginning and end",

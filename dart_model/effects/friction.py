@@ -13,8 +13,20 @@ from dart_model.effects.ranges import crossing_time_s, grid, moving, of_speed, o
 _SLIDING = "motion that changes direction, and slow passages"
 _COULOMB = Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction")
 _STATIC = Parameter("static_to_coulomb", "", 1.0, 5.0, "break-away over sliding friction")
-_STRIBECK = Parameter("stribeck_velocity_m_per_s", "m/s", 1e-12, 1e6, "where friction has fallen")
-_ROUNDING = Parameter("rounding_velocity_m_per_s", "m/s", 1e-12, 1e6, "width of the rounded sign")
+_STRIBECK = Parameter(
+    "stribeck_velocity_m_per_s",
+    "m/s",
+    1e-12,
+    1e6,
+    "velocity scale of the fall from break-away to sliding friction",
+)
+_ROUNDING = Parameter(
+    "rounding_velocity_m_per_s",
+    "m/s",
+    1e-12,
+    1e6,
+    "velocity scale over which the change of sign is rounded",
+)
 _PRESLIDING = Parameter("presliding_m", "m", 1e-12, 1e4, "deflection at which sliding begins")
 
 # A bristle settles at |velocity| / presliding, without bound; what is faster than this rate (1/s)

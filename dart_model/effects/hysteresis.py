@@ -8,7 +8,7 @@ from dart_model.effects.ranges import geometric, grid, moving, of_least_stroke, 
 
 _LOOPS = "loops of different amplitude and frequency"
 # A loop that turned the other way would make energy out of nothing.
-_LIMIT = Parameter("yield_force_n", "N", 0.0, 1e12, "force at which the loop is fully bent")
+_LIMIT = Parameter("yield_force_n", "N", 0.0, 1e12, "largest force of the loop")
 _BEND = Parameter("yield_displacement_m", "m", 1e-12, 1e4, "travel from rest to full force")
 
 ELEMENTS = 8
@@ -178,8 +178,8 @@ BOUC_WEN = _hysteresis(
     parameters=(
         _LIMIT,
         _BEND,
-        Parameter("exponent", "", 0.8, 10.0, "sharpness of the bend"),
-        Parameter("shape", "", 0.0, 1.0, "0.5: unloading is elastic"),
+        Parameter("exponent", "", 0.8, 10.0, "sharpness of the transition to the largest force"),
+        Parameter("shape", "", 0.0, 1.0, "shape of the loop; 0.5: it unloads elastically"),
     ),
     force=_yielding,
     reference="Ikhouane and Rodellar, Systems with Hysteresis (2007)",
@@ -194,7 +194,11 @@ BOUC_WEN = _hysteresis(
 DAHL = _hysteresis(
     name="dahl",
     words="hysteresis (Dahl)",
-    parameters=(_LIMIT, _BEND, Parameter("exponent", "", 0.3, 4.0, "sharpness of the bend")),
+    parameters=(
+        _LIMIT,
+        _BEND,
+        Parameter("exponent", "", 0.3, 4.0, "sharpness of the transition to the largest force"),
+    ),
     force=_yielding,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",
     rate=_dahl_rate,
@@ -210,8 +214,8 @@ GENERAL_BOUC_WEN = _hysteresis(
     words="hysteresis (Bouc-Wen, general: it may harden)",
     parameters=(
         Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness at the start of a loop"),
-        Parameter("bend_m", "m", 1e-12, 1e4, "travel by which the loop bends"),
-        Parameter("exponent", "", 0.5, 5.0, "sharpness of the bend"),
+        Parameter("bend_m", "m", 1e-12, 1e4, "travel over which the loop yields"),
+        Parameter("exponent", "", 0.5, 5.0, "sharpness of the transition to the largest force"),
         Parameter(
             "angle_rad",
             "rad",
@@ -237,7 +241,7 @@ FRICTION_BEHIND_PLAY = _hysteresis(
         Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction"),
         Parameter("gap_m", "m", 1e-12, 1e4, "width of the play"),
         Parameter("travel_m", "m", 1e-12, 1e4, "elastic travel to full force"),
-        Parameter("exponent", "", 0.3, 4.0, "sharpness of the bend"),
+        Parameter("exponent", "", 0.3, 4.0, "sharpness of the transition to the largest force"),
     ),
     force=_behind_play,
     reference="Baber and Noori, J. Eng. Mech. 111 (1985), pinching; Nordin and Gutman (2002)",
@@ -268,8 +272,14 @@ MAXWELL = _hysteresis(
     name="maxwell",
     words="hysteresis (a Maxwell branch)",
     parameters=(
-        Parameter("stiffness_n_per_m", "N/m", 0.0, 1e12, "spring in series with a damper"),
-        Parameter("relaxation_time_s", "s", 1e-6, 1e9, "damping over stiffness"),
+        Parameter(
+            "stiffness_n_per_m",
+            "N/m",
+            0.0,
+            1e12,
+            "stiffness of the spring that is in series with a damper",
+        ),
+        Parameter("relaxation_time_s", "s", 1e-6, 1e9, "damping of this damper over the stiffness"),
     ),
     force=_spring,
     excitation="frequencies above and below the inverse of the relaxation time",

@@ -32,7 +32,9 @@ INERTER = Effect(
     family="inertia",
     words="inertia between the bodies (an inerter)",
     parameters=(
-        Parameter("inertance_kg", "kg", -1e9, 1e9, "force per acceleration, without weight"),
+        Parameter(
+            "inertance_kg", "kg", -1e9, 1e9, "force per relative acceleration; it has no weight"
+        ),
     ),
     force=_weight_compensation,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",

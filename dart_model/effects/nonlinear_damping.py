@@ -22,7 +22,7 @@ _PLACES = "the same velocities at different heights"
 _DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
 _KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
 _LOST_DAMPING = Parameter(
-    "lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"
+    "lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "reduction of the damping beyond the knee"
 )
 
 
@@ -194,8 +194,8 @@ ASYMMETRIC_DAMPING = _damper(
     name="asymmetric_damping",
     words="a non-linear damper (rebound and compression differ)",
     parameters=(
-        Parameter("compression_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights fall"),
-        Parameter("rebound_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights rise"),
+        Parameter("compression_n_s_per_m", "N·s/m", -1e12, 1e12, "damping in compression"),
+        Parameter("rebound_n_s_per_m", "N·s/m", -1e12, 1e12, "damping in rebound"),
     ),
     force=_asymmetric,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.2",
@@ -208,10 +208,10 @@ DIRECTIONAL_DAMPING = _damper(
     name="directional_damping",
     words="a non-linear damper (rebound and compression, each by a power law)",
     parameters=(
-        Parameter("compression_at_1_m_per_s_n", "N", -1e18, 1e18, "force as heights fall by 1 m/s"),
-        Parameter("compression_exponent", "", 0.3, 4.0, "exponent of the velocity there"),
-        Parameter("rebound_at_1_m_per_s_n", "N", -1e18, 1e18, "force as heights rise by 1 m/s"),
-        Parameter("rebound_exponent", "", 0.3, 4.0, "exponent of the velocity there"),
+        Parameter("compression_at_1_m_per_s_n", "N", -1e18, 1e18, "force in compression at 1 m/s"),
+        Parameter("compression_exponent", "", 0.3, 4.0, "exponent of the velocity in compression"),
+        Parameter("rebound_at_1_m_per_s_n", "N", -1e18, 1e18, "force in rebound at 1 m/s"),
+        Parameter("rebound_exponent", "", 0.3, 4.0, "exponent of the velocity in rebound"),
     ),
     force=_directional,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.9 and 7.2, valves of each direction",
@@ -291,7 +291,9 @@ SMOOTH_BLOW_OFF_DAMPING = _damper(
 STROKE_DAMPING = _damper(
     name="stroke_damping",
     words="a non-linear damper (linear in the stroke)",
-    parameters=(Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per deflection"),),
+    parameters=(
+        Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per metre of deflection"),
+    ),
     force=_over_stroke,
     excitation=_PLACES,
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
@@ -319,7 +321,13 @@ ZONE_DAMPING = _damper(
     parameters=(
         _DAMPING,
         Parameter("centre_height_m", "m", -1e4, 1e4, "middle of the zone"),
-        Parameter("width_m", "m", 1e-12, 1e4, "half width of the zone"),
+        Parameter(
+            "width_m",
+            "m",
+            1e-12,
+            1e4,
+            "distance from the middle at which the damping has fallen to 37 %",
+        ),
     ),
     force=_zone,
     excitation=_PLACES,
@@ -333,7 +341,9 @@ END_ZONE_DAMPING = _damper(
     name="end_zone_damping",
     words="a non-linear damper (hydraulic end stop)",
     parameters=(
-        Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per depth in the zone"),
+        Parameter(
+            "damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per metre of depth in the zone"
+        ),
         Parameter("zone_height_m", "m", -1e4, 1e4, "height below which the zone begins"),
     ),
     force=_end_zone,

@@ -10,7 +10,7 @@ _WIDE = "deflections from the free length that differ by a factor of three or mo
 _LARGEST_EXPONENT = 40.0
 _GAS = (
     Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
-    Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+    Parameter("polytropic_exponent", "", 1.0, 3.0, "1: isothermal, 1.4: adiabatic (air)"),
 )
 
 
@@ -123,7 +123,7 @@ CENTRED_CUBIC_STIFFNESS = _spring(
     words="a non-linear spring (cubic, about a centre of its own)",
     parameters=(
         Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
-        Parameter("centre_height_m", "m", -1e4, 1e4, "height without force"),
+        Parameter("centre_height_m", "m", -1e4, 1e4, "height at which the force is zero"),
     ),
     force=_centred_cubic,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
@@ -153,7 +153,7 @@ PROGRESSIVE_STIFFNESS = _spring(
     words="a non-linear spring (progressive)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
-        Parameter("length_m", "m", 1e-12, 1e4, "deflection at which the spring stiffens"),
+        Parameter("length_m", "m", 1e-12, 1e4, "deflection from which the spring stiffens clearly"),
     ),
     force=_progressive,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
@@ -169,7 +169,9 @@ EXPONENTIAL_STIFFNESS = _spring(
     words="a non-linear spring (exponential, as rubber)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
-        Parameter("length_m", "m", 1e-12, 1e4, "compression by which the force grows e-fold"),
+        Parameter(
+            "length_m", "m", 1e-12, 1e4, "compression over which the force grows by a factor of e"
+        ),
     ),
     force=_exponential,
     reference="Gent, Engineering with Rubber (2012), 3.2",
@@ -198,7 +200,13 @@ BALANCED_GAS_SPRING = _spring(
     name="balanced_gas_spring",
     words="a gas spring (polytropic, balanced at the free length)",
     parameters=(
-        Parameter("charge_force_n", "N", -1e12, 1e12, "charge, balanced at the free length"),
+        Parameter(
+            "charge_force_n",
+            "N",
+            -1e12,
+            1e12,
+            "gas force at the free length, which a constant force balances",
+        ),
         *_GAS,
     ),
     force=_balanced_gas,

@@ -213,13 +213,25 @@ _LINEAR = (
 _HERTZ = (
     _CONTACT,
     Parameter("contact_stiffness_n_per_m1_5", "N/m^1.5", 1e-12, 1e18, "Hertzian stiffness"),
-    Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
+    Parameter(
+        "dissipation_s_per_m",
+        "s/m",
+        0.0,
+        1e12,
+        "relative increase of the force per m/s of closing speed",
+    ),
 )
 _POWER = (
     _CONTACT,
     Parameter("force_at_10_mm_n", "N", 1e-12, 1e24, "force at a depth of 10 mm"),
     Parameter("exponent", "", 0.8, 4.0, "exponent of the depth"),
-    Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
+    Parameter(
+        "dissipation_s_per_m",
+        "s/m",
+        0.0,
+        1e12,
+        "relative increase of the force per m/s of closing speed",
+    ),
 )
 
 _stop = partial(Effect, family="stop", scaled=(1,))

@@ -37,12 +37,13 @@ class DeviceSettings(BaseModel):
     """A device that reports its state; its frames are refused while it is at fault.
 
     Attributes:
-        node_id: CANopen node id; a device has this or a NAME.
-        emergency_id: Arbitration id of its emergency frames; 128 and the node id if absent.
-        heartbeat_s: Longest time between two heartbeats; they are not watched if absent.
-        alarms: Signals that are other than zero while the device is at fault.
-        j1939_name: NAME of a J1939 device: 64 bits, as it claims its address with.
-        source_address: Address of a J1939 device at the start; a claim later on changes it.
+        node_id: CANopen node id; a device has either this or `j1939_name`.
+        emergency_id: Arbitration id of the device's emergency frames; 128 plus the node id if
+            absent.
+        heartbeat_s: Longest permitted time between two heartbeats; not monitored if absent.
+        alarms: Signals that are not zero while the device is at fault.
+        j1939_name: NAME of a J1939 device: the 64 bits with which it claims its address.
+        source_address: Address of a J1939 device at the start; a later address claim changes it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

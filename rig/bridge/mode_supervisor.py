@@ -108,27 +108,27 @@ class Supervision(BaseModel):
     """Ages of the measurement, arming, ramps, the output of the safe state, the table of limits.
 
     Attributes:
-        stale_after_s: Age of a height from which the estimate is marked invalid.
-        safe_after_s: Age from which the safe state is entered.
+        stale_after_s: Age of a height or applied force from which the estimate is invalid (HOLD).
+        safe_after_s: Age of a height or applied force from which the bridge enters the safe state.
         settling_s: Time after a start, a change of gains or a saturated virtual force until an
-            estimate is valid. By default that in which a step of the residual force decays to a
-            hundredth in the closed loop; none for an observer that knows its variance, which
-            settles with it.
-        overload_share: Share of missed ticks, over the last few hundred, from which the estimate is
-            marked invalid.
+            estimate is valid. By default the time in which a step of the residual force decays to a
+            hundredth in the closed loop; for `kalman` the filter's variance decides.
+        overload_share: Share of missed ticks, of the last few hundred, from which the estimate is
+            invalid (HOLD).
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
             has to arm the bridge first, after each start and each safe state.
         fade_in_s: Time in which the published force fades in, from the safe output to the
             estimate, before it is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
-            output. With neither of the two it is that of the model in HOLD, and in SAFE at once
-            the safe output.
-        watchdog: Whether a second process sends the safe output when the loop stands still for
-            `safe_after_s`, or its process dies; where several processes can share the interface.
-        log_fault: What follows when the log cannot be written: `continue`, or the `safe` state.
-        safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
-        limits: What is done beyond which values, row by row. Where none stands for a value, the
-            DBC's ranges limit measured height, model height and published force.
+            output. Without `fade_in_s` and `slew_n_per_s`, the model's force is published in HOLD,
+            and the safe output at once in SAFE.
+        watchdog: Whether a second process sends the safe output if the loop stands still for
+            `safe_after_s` or its process dies; only on interfaces that several processes can share.
+        log_fault: Reaction to a log that cannot be written: `continue`, or `safe` for the safe
+            state.
+        safe_output: Force that is published in the safe state: `zero`, or the `last` valid one.
+        limits: Table of limits. For a value without a row, the range of its signal in the DBC
+            applies to measured values, model height and published force.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

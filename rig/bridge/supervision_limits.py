@@ -66,24 +66,26 @@ class Limit(BaseModel):
     """One row of the table of limits.
 
     Attributes:
-        strut: Strut that it is for; every strut if absent.
-        channel: Other measured signal that it is for: a key of `signals` such as `applied_force`,
-            or a further sensor as `strut.sensor`.
-        value: What is limited, with its unit. Of a measured height: `measured_height_m`,
-            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of
-            another measured signal: `measured` and `measured_rate_per_s` in its unit by SI,
-            `unchanged_s`. Of the estimate: `height_m`, `force_n`, `virtual_force_n`,
-            `innovation_m`; and of one that has settled `force_std_n` (its standard deviation, as
-            its observer states it), `force_rate_n_per_s` (its change since the last tick) and
-            `force_difference_n` (the estimated force less that of the load cell).
-        low: Smallest value within.
-        high: Largest value within.
-        for_s: How long an estimate has to be beyond the limit until the action begins; for
-            estimates alone.
-        clear_s: How long it has to be within the limit until the action ends: `for_s` by default;
-            1 s for `force_difference_n`, since a wrong force that swings crosses the right one.
-        action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
-            estimate invalid as long as it lasts; `safe` enters the safe state.
+        strut: Strut to which the limit applies; every strut if absent.
+        channel: Measured signal, other than a height, to which the limit applies: a key of
+            `signals` such as `applied_force`, or a further sensor as `strut.sensor`.
+        value: Limited value, in SI units. Of a measured height: `measured_height_m`,
+            `measured_rate_m_per_s`, or `unchanged_s` (time for which the reading stays exactly the
+            same). Of another measured signal (`channel`): `measured`, `measured_rate_per_s` or
+            `unchanged_s`. Of the estimate: `height_m`, `force_n`, `virtual_force_n` or
+            `innovation_m`. Of an estimate that has settled: `force_std_n` (its standard deviation),
+            `force_rate_n_per_s` (its change since the last tick) or `force_difference_n` (estimated
+            force less that of the load cell).
+        low: Smallest permitted value.
+        high: Largest permitted value.
+        for_s: Time for which a value of the estimate has to be beyond the limit until the action
+            begins.
+        clear_s: Time for which it has to be within the limit until the action ends; by default
+            `for_s`, and at least 1 s for `force_difference_n`, because a wrong force that
+            oscillates crosses the right one.
+        action: `warn` reports the value in the status; `refuse` also drops the measurement; `hold`
+            makes the estimate invalid while the value is beyond the limit; `safe` enters the safe
+            state.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -68,10 +68,10 @@ class AuthenticationSettings(BaseModel):
         key_file: File with 32 hexadecimal digits, in the folder of the configuration.
         freshness_bits: Bits of the freshness value in a frame.
         mac_bits: Bits of the CMAC in a frame.
-        clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
-            recorded longer ago is refused also by a bridge that has just been started.
-        max_age_s: How old a frame may be by the bridge's own clock, or ahead of it, during the
-            whole run; never less than the tolerance. Clocks that drift apart need it.
+        clock_tolerance_s: Largest difference between the clocks of bench and bridge at the start.
+            Even a bridge that has just been started refuses a frame that was recorded longer ago.
+        max_age_s: Largest age of a frame by the bridge's own clock, or lead over it, during the
+            run, which allows for clocks that drift apart; at least the tolerance.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -33,11 +33,11 @@ SignalOfMessage = Annotated[str, Field(min_length=1, max_length=255)]
 
 
 class ValidSignal(BaseModel):
-    """What says that a measured value is valid.
+    """A signal that shows whether a measured value is valid.
 
     Attributes:
         signal: Signal of the same message, an integer or a float without a unit.
-        value: Its value while the measured one is valid.
+        value: Value of this signal while the measured one is valid.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -50,8 +50,8 @@ class Zero(BaseModel):
     """A reading of a position sensor at a known length of the strut; `rig zero` measures it.
 
     Attributes:
-        reads: What the sensor reads, by the DBC, in m.
-        at_m: Length of the strut at that reading.
+        reads: Reading of the sensor in m, as the DBC scales it.
+        at_m: Length of the strut at that reading, in m.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -66,18 +66,18 @@ class MeasuredSignal(SignalName):
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that says whether the sensor measures; a frame in which it
-            has another value is refused. Every value counts if absent.
-        counter: Signal of the same message that is one more with every frame, where no CRC protects
-            it: it shows frames that are lost, repeated or out of sequence, and with the cycle time
-            when they were sampled.
-        time: Signal of the same message with the sensor's time of the sample; it may begin again
-            at the end of its range.
-        zero: Of a height: a reading at a known length of the strut. Without it the reading is the
+        valid: Signal of the same message that shows whether the sensor measures; a frame in which
+            it has another value is refused. If absent, every value is used.
+        counter: Signal of the same message that rises by one with every frame, for a message
+            without E2E protection. It shows frames that are lost, repeated or out of sequence, and
+            with the cycle time the times of the samples.
+        time: Signal of the same message with the sensor's time of the sample; it may restart at the
+            end of its range.
+        zero: For a height: a reading at a known length of the strut. Without it the reading is the
             length.
-        reversed: Whether the sensor reads less while what it measures grows; of a height with a
-            zero, a velocity or a force.
-        tare_n: Of a force: what the sensor reads, by the DBC, without one; 0 by default.
+        reversed: True if the reading falls while the quantity grows; for a height with a zero, a
+            velocity or a force.
+        tare_n: For a force: the reading without a force in N, as the DBC scales it; 0 if absent.
     """
 
     valid: ValidSignal | None = None

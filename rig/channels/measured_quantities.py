@@ -26,6 +26,7 @@ class Quantity:
 
     Attributes:
         key: Its key under `signals`; of a further sensor of a strut, what it `measures`.
+        words: Its meaning and its sign, for the guide.
         noise: Noise of a sensor that measures it on a strut; None for a quantity of the bench.
     """
 
@@ -37,7 +38,11 @@ class Quantity:
 
 
 HEIGHT = Quantity(
-    "height", "height_m", Dimension.LENGTH, "height", SensorNoise("noise_std_m", 1e-9, 1.0)
+    "height",
+    "height_m",
+    Dimension.LENGTH,
+    "height of a strut",
+    SensorNoise("noise_std_m", 1e-9, 1.0),
 )
 """Height of a strut; the one under `signals.height` is the reference of its observer."""
 
@@ -52,7 +57,7 @@ FORCE = Quantity(
     "force",
     "force_n",
     Dimension.FORCE,
-    "force of a load cell in the strut, positive when the strut pushes",
+    "force of a load cell in the strut, positive when the strut pushes its ends apart",
     SensorNoise("noise_std_n", 1e-4, 1e7),
 )
 
@@ -62,18 +67,32 @@ STRUT_QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
 """What a sensor of a strut may measure, by key. `rig.observers.strut_sensors` defines the
 reading of each on the model."""
 
-APPLIED_FORCE = Quantity("applied_force", "applied_force_n", Dimension.FORCE, "applied force")
+APPLIED_FORCE = Quantity(
+    "applied_force",
+    "applied_force_n",
+    Dimension.FORCE,
+    "force that the actuator applies to the body, positive upwards, without the weight",
+)
 LOAD_CELL_FORCE = Quantity(
-    "load_cell_force", "strut_force_n", Dimension.FORCE, "force of the load cell"
+    "load_cell_force",
+    "strut_force_n",
+    Dimension.FORCE,
+    "force of the strut by a load cell, positive when the strut pushes its ends apart",
 )
 TEMPERATURE = Quantity(
     "temperature", "temperature_c", Dimension.TEMPERATURE, "temperature of the damper"
 )
 INTERLOCK = Quantity(
-    "interlock", "interlock", Dimension.NUMBER, "interlock of the bench: other than 0 when closed"
+    "interlock",
+    "interlock",
+    Dimension.NUMBER,
+    "interlock of the bench: 0 while it is open, any other value while it is closed",
 )
 ENABLE = Quantity(
-    "enable", "enable", Dimension.NUMBER, "enable signal of the bench's controller: other than 0"
+    "enable",
+    "enable",
+    Dimension.NUMBER,
+    "enable signal of the bench's controller: an estimate can be valid only while it is not 0",
 )
 SWITCHES = (INTERLOCK, ENABLE)
 """What permits valid estimates, or forbids them; `rig.bridge.arming` uses them."""

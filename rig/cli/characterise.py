@@ -33,11 +33,13 @@ EXAMPLES = (
 
 Tolerance = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Band about a master curve, YAML or CSV: pass or fail."),
+    typer.Option(metavar="FILE", help="Tolerance band about a master curve, YAML or CSV."),
 ]
 Master = Annotated[
     Path | None,
-    typer.Option(metavar="RUN", help="Record of a good damper, same test: name what is wrong."),
+    typer.Option(
+        metavar="RUN", help="Record of a good damper in the same test, to name what is wrong."
+    ),
 ]
 Scatter = Annotated[
     float,
@@ -53,7 +55,7 @@ Scatter = Annotated[
 def characterise_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN", help="Folders of runs, or CSV files of measured data."),
+        typer.Argument(metavar="RUN", help="Run folders, or CSV files of measured data."),
     ],
     strut: StrutOfRun = None,
     out: Annotated[
@@ -71,9 +73,9 @@ def characterise_command(
 ) -> None:
     """Report the figures of a damper: force over velocity, energy, gas force, friction, knee.
 
-    The cycles of a record must repeat; the page lays several records over one another. With a
-    tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
-    unless the damper is as good as it.
+    The cycles of a record must repeat; the report overlays several records. With --tolerance, the
+    exit code is 1 unless every point of the band passes; with --master, unless the damper
+    is as good as the master.
     """
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance

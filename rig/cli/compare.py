@@ -22,18 +22,20 @@ EXAMPLES = (
 def compare_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN", help="Folders of runs, or CSV files: states of one damper."),
+        typer.Argument(metavar="RUN", help="Run folders, or CSV files: states of one damper."),
     ],
     dose: Annotated[
         list[float] | None,
-        typer.Option(metavar="NUMBER", help="Pressure, clicks, °C of a state; once for each."),
+        typer.Option(
+            metavar="NUMBER", help="Pressure, clicks or °C of a state; once for each state."
+        ),
     ] = None,
     strut: StrutOfRun = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Compare two states of a damper: which figures differ, by how much, and which do not.
+    """Compare two states of a damper: list the figures that differ significantly, and the others.
 
-    With --dose, once for each state: the change of each figure over the dose.
+    With --dose, once for each state: fit the change of each figure over the dose.
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, trends_over_dose

@@ -24,7 +24,7 @@ def demo(
         str,
         typer.Option(
             metavar="CASE",
-            help=f"{STORY}: the whole story; or a plain case: reference, quarter_car, dyno.",
+            help=f"{STORY}: the whole method; or one of the cases reference, quarter_car, dyno.",
         ),
     ] = STORY,
     seed: Annotated[
@@ -37,17 +37,18 @@ def demo(
         Path | None, typer.Option(metavar="DIR", help="Folder to write into; rig-demo by default.")
     ] = None,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
+        bool,
+        typer.Option("--lockstep", help="With a simulated clock, as fast as the machine allows."),
     ] = False,
     duration_s: Annotated[
-        float | None, typer.Option(metavar="S", min=1.0, help="Length of a run.")
+        float | None, typer.Option(metavar="S", min=1.0, help="Duration of a run.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
 
-    The story: a bench with an undeclared effect, logged by the bridge, diagnosed, corrected, and
-    run again.
+    By default a bench with an undeclared effect is simulated; its run is logged and diagnosed, the
+    model is corrected, and the bench is run again.
     """
     from rig.demo.cases import CASES, DemoOptions, run_case
 

@@ -14,19 +14,20 @@ EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 -
 
 
 def diagnose(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN", help="Folders of runs, or CSV files.")
-    ],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folders, or CSV files.")],
     model: Annotated[
         str,
-        typer.Option(metavar="MODEL", help="Model file, or the name of a shipped one."),
+        typer.Option(metavar="MODEL", help="Model file, or the name of a shipped model."),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write into.")],
     held_out: Annotated[
-        list[Path] | None, typer.Option(metavar="RUN", help="Held-out run; once for each.")
+        list[Path] | None, typer.Option(metavar="RUN", help="Held-out run; may be repeated.")
     ] = None,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Print the report too; requires Chromium, Chrome or Edge.")
+        bool,
+        typer.Option(
+            "--pdf", help="Also write the report as PDF; requires Chromium, Chrome or Edge."
+        ),
     ] = False,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,

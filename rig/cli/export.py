@@ -26,33 +26,41 @@ def export_command(
     out: Annotated[Path, typer.Option(metavar="PATH", help="New file; for Parquet a folder.")],
     kind: Annotated[
         str | None,
-        typer.Option("--format", metavar="FORMAT", help="Of a run: mf4, parquet, csv or candump."),
+        typer.Option(
+            "--format", metavar="FORMAT", help="Format for a run: mf4, parquet, csv or candump."
+        ),
     ] = None,
     smoothed: Annotated[
         bool,
         typer.Option(
-            "--smoothed", help="With --format csv: also the forces smoothed over the whole run."
+            "--smoothed", help="With --format csv: add the forces smoothed over the whole run."
         ),
     ] = False,
     fmu: Annotated[
-        bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
+        bool,
+        typer.Option("--fmu", help="Export a strut of a model as a functional mock-up unit (FMU)."),
     ] = False,
-    fmi: Annotated[str, typer.Option(metavar="VERSION", help="With --fmu: 2.0 or 3.0.")] = "2.0",
+    fmi: Annotated[
+        str, typer.Option(metavar="VERSION", help="With --fmu: version of FMI, 2.0 or 3.0.")
+    ] = "2.0",
     strut: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="With --fmu: which strut, if there are several."),
+        typer.Option(metavar="NAME", help="With --fmu: strut to export, if there are several."),
     ] = None,
     bench: Annotated[
         bool,
-        typer.Option("--bench", help="With --fmu: the whole bench, if one guided degree moves."),
+        typer.Option(
+            "--bench",
+            help="With --fmu: export the whole bench, of one guided degree of freedom.",
+        ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Export a run or a model to other programs.
 
-    A run becomes MF4, Parquet, CSV or candump; a model, with --fmu, a functional mock-up unit for
-    Model Exchange and Co-Simulation, with its C sources and with binaries for Linux, Windows and
-    macOS.
+    A run is written as MF4, Parquet, CSV or candump. With --fmu, a model is written as a functional
+    mock-up unit for Model Exchange and Co-Simulation, with its C sources and with binaries for
+    Linux, Windows and macOS.
     """
     if fmu == (kind is not None):
         raise InputError("--format and --fmu: expected one of them")

@@ -46,7 +46,7 @@ class _OrRun(PlainGroup):
 
 app = typer.Typer(
     cls=_OrRun,
-    help="Many runs of many dampers: diagnose them, keep the results, report over them. "
+    help="Diagnose many runs of many dampers, store the results, and report on them. "
     "`rig fleet SOURCE...` is `rig fleet run SOURCE...`.",
     no_args_is_help=True,
 )
@@ -64,13 +64,13 @@ QUERY_EXAMPLES = (
 )
 REPORT_EXAMPLES = "Examples: `rig fleet report store` · `rig fleet report store --out fleet.html`"
 
-Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that `rig fleet` wrote.")]
+Store = Annotated[Path, typer.Argument(metavar="STORE", help="Store that `rig fleet run` wrote.")]
 PathPattern = Annotated[
     str | None,
     typer.Option(
         metavar="PATTERN",
-        help="Path of a run below its SOURCE with {bench}, {damper}, {date} and *; without it the "
-        "folder above it is the bench, and a date is looked for in the path.",
+        help="Path of a run below its SOURCE, with {bench}, {damper}, {date} and *. Without it, "
+        "the folder above the run is the bench, and the path is searched for a date.",
     ),
 ]
 
@@ -81,25 +81,33 @@ def run_command(
         list[str],
         typer.Argument(
             metavar="SOURCE",
-            help="Run folders, CSV files, or folders of them; also as URLs that fsspec knows.",
+            help="Run folders, CSV files, or folders of them; also as URLs that fsspec supports.",
         ),
     ],
     model: Annotated[
-        str, typer.Option(metavar="MODEL", help="Model file, or a shipped one's name.")
+        str, typer.Option(metavar="MODEL", help="Model file, or the name of a shipped model.")
     ],
-    out: Annotated[Path, typer.Option(metavar="STORE", help="Store, new or to continue.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="STORE", help="Store: a new folder, or an existing store to continue."
+        ),
+    ],
     path: PathPattern = None,
     jobs: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes; by default one a core.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="Number of processes; by default one per core."),
     ] = None,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that runs.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Address of the scheduler of a running Dask cluster."),
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, from 1 on.")
+        str | None,
+        typer.Option(metavar="I/N", help="Compute only the I-th of N parts; I begins at 1."),
     ] = None,
     again: Annotated[
-        bool, typer.Option("--again", help="Try runs again that failed before.")
+        bool, typer.Option("--again", help="Also compute runs again that failed before.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> int:
@@ -174,15 +182,18 @@ def _progress() -> "Generator[Callable[[CampaignProgress], None]]":
 def query_command(
     store: Store,
     sql: Annotated[
-        str, typer.Argument(metavar="SQL", help="Over the views runs, effects and values.")
+        str,
+        typer.Argument(
+            metavar="SQL", help="SELECT statement over the views runs, effects and values."
+        ),
     ],
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print the result as CSV.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Query a store in SQL (DuckDB): one SELECT statement, which opens no other file.
 
-    `runs` has a row a run, `effects` a row a parameter of the model (kind `model`) or of an effect
-    that it lacks (`found`), `values` also the figures of `rig characterise` (`figure`).
+    `runs` has one row per run, `effects` one row per parameter of the model (kind `model`) or of an
+    effect that it lacks (`found`); `values` also has the figures of `rig characterise` (`figure`).
     """
     from rig.fleet.store import query
 
@@ -208,7 +219,7 @@ def _plain(value: object) -> object:
 def report_command(
     store: Store,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="New HTML file, a page of it.")
+        Path | None, typer.Option(metavar="FILE", help="New HTML file for the report.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:

@@ -28,46 +28,55 @@ Rebound = Annotated[
     str | None,
     typer.Option(
         metavar="SIGN",
-        help="positive or negative: sign of the force in rebound, for an MTS file without "
-        "--mapping, whose names and units are then its own.",
+        help="Sign of the force in rebound, positive or negative, for an MTS file without "
+        "--mapping; names and units are then those of the file.",
     ),
 ]
 FmuFlag = Annotated[
     bool,
     typer.Option(
         "--fmu",
-        help="SOURCE is an FMU, of which a model is made; --mapping gives the roles of its "
-        "variables, if they are not called as in an FMU of `rig export`.",
+        help="Make a model from SOURCE, an FMU. --mapping names the variables by their roles, "
+        "unless they have the names of an FMU of `rig export`.",
     ),
 ]
 
 
 def import_command(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="Table or folder of tables, bus log, export.")
+        Path,
+        typer.Argument(
+            metavar="SOURCE", help="Table, folder of tables, bus log, exported run, or FMU."
+        ),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="PATH", help="CSV file, or folder: of a run, of many.")
+        Path,
+        typer.Option(
+            metavar="PATH",
+            help="New CSV file for a table; new folder for a run, tables or a model.",
+        ),
     ],
     mapping: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Columns and units of a foreign table.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Mapping with the columns and units of a table."),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Signals of a bus log, with its DBC.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Configuration with the DBC and signals of a bus log."),
     ] = None,
     rebound: Rebound = None,
     fmu: FmuFlag = False,
     mass_kg: Annotated[
-        float | None, typer.Option(metavar="KG", help="With --fmu: what a strut alone carries.")
+        float | None, typer.Option(metavar="KG", help="With --fmu: mass that the strut carries.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Import a foreign table as CSV, a bus log or an export as a run, an FMU as a model.
 
-    A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, or --rebound if it is of MTS; a bus log
-    (BLF, ASC, candump, TRC, MF4) requires --config; what `rig export` wrote as MF4 or Parquet
-    requires neither, and its CSV is read as it is by what reads runs. With --fmu, SOURCE is a
-    functional mock-up unit: a program, which from then on may run on this machine.
+    A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, an MTS file at least --rebound. A bus
+    log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export` wrote as MF4 or
+    Parquet requires neither; one that it wrote as CSV need not be imported. With --fmu, SOURCE is a
+    functional mock-up unit: a program, which is then permitted to run on this machine.
     """
     if fmu:
         if config is not None or rebound is not None:

@@ -46,26 +46,29 @@ Out = Annotated[
 ]
 Height = Annotated[
     str | None,
-    typer.Option(metavar="MESSAGE.SIGNAL", help="The height, if not the likeliest signal."),
+    typer.Option(metavar="MESSAGE.SIGNAL", help="Signal of the height, if not the likeliest one."),
 ]
 AppliedForce = Annotated[
-    str | None, typer.Option(metavar="MESSAGE.SIGNAL", help="Force on the body, or `none`.")
+    str | None,
+    typer.Option(metavar="MESSAGE.SIGNAL", help="Signal of the force on the body, or `none`."),
 ]
 LoadCell = Annotated[
     str | None,
-    typer.Option(metavar="MESSAGE.SIGNAL", help="Force measured in the strut, or `none`."),
+    typer.Option(metavar="MESSAGE.SIGNAL", help="Signal of the load cell in the strut, or `none`."),
 ]
 Mass = Annotated[
     float | None,
-    typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries."),
+    typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries, in kg."),
 ]
 LengthAtRest = Annotated[
     float | None,
-    typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest."),
+    typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest, in m."),
 ]
 Stiffness = Annotated[
     float | None,
-    typer.Option(metavar="N/M", min=1e-3, max=1e9, help="Stiffness, from a catalogue."),
+    typer.Option(
+        metavar="N/M", min=1e-3, max=1e9, help="Stiffness of the spring, such as from a catalogue."
+    ),
 ]
 Damping = Annotated[
     float | None,
@@ -75,12 +78,17 @@ Damping = Annotated[
 ]
 Run = Annotated[
     Path | None,
-    typer.Option(metavar="RUN", help="Stiffness and damping from a run's folder or a CSV file."),
+    typer.Option(
+        metavar="RUN", help="Estimate stiffness and damping from a run folder or a CSV file."
+    ),
 ]
 ListenSeconds = Annotated[
     float | None,
     typer.Option(
-        metavar="S", min=1.0, max=600.0, help="Stiffness and damping from the moving bench now."
+        metavar="S",
+        min=1.0,
+        max=600.0,
+        help="Listen to the moving bench for S seconds and estimate stiffness and damping.",
     ),
 ]
 

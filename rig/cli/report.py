@@ -18,11 +18,11 @@ def report(
         typer.Option(metavar="FILE", help="File to write; RUN/report.html by default."),
     ] = None,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Print it too; requires Chromium, Chrome or Edge.")
+        bool, typer.Option("--pdf", help="Also write it as PDF; requires Chromium, Chrome or Edge.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Report a run on a page: what ran, how well, timing, faults. One file, no network."""
+    """Write a report of a run as one HTML file: configuration, errors, timing, faults."""
     from rig.log.checksums import refuse_damage
     from rig.pages.browser_print import print_page
     from rig.pages.run_report import write_run_report

@@ -45,13 +45,16 @@ SET_EXAMPLES = (
 )
 
 ListenSeconds = Annotated[
-    float, typer.Option(metavar="S", min=0.0, max=600.0, help="How long to listen first.")
+    float,
+    typer.Option(
+        metavar="S", min=0.0, max=600.0, help="Time to listen before the first request, in s."
+    ),
 ]
 EdsFiles = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NODE=FILE",
-        help="Describe a sensor that is not on a bus by its EDS file; no bus is opened.",
+        help="Describe a sensor that is not connected by its EDS file; no bus is opened.",
     ),
 ]
 CycleMs = Annotated[
@@ -64,7 +67,7 @@ Before = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="New file for the contents before; sensor-NODE-before.yaml by default.",
+        help="New file for the previous contents; sensor-NODE-before.yaml by default.",
     ),
 ]
 
@@ -87,9 +90,9 @@ def scan_command(
 ) -> None:
     """Find the CANopen and J1939 sensors on a bus, and write a DBC and a configuration.
 
-    The device type of every CANopen node id is requested, and the process data of each device; a
-    J1939 bus is asked for addresses; nothing is changed. On a bus with devices of another kind,
-    whose frames may have another meaning under these ids, use --listen-only.
+    The device type is requested from every CANopen node id, the process data from each device, and
+    address claims from J1939 devices; nothing is changed. On a bus with other devices, for which
+    these requests may have another meaning, use --listen-only.
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork
@@ -125,7 +128,10 @@ def set_command(
     ] = None,
     cycle_ms: CycleMs = None,
     sync: Annotated[
-        bool, typer.Option("--sync", help="Send at SYNC, which the device then produces.")
+        bool,
+        typer.Option(
+            "--sync", help="Send at SYNC messages, which the device then produces itself."
+        ),
     ] = False,
     heartbeat_ms: HeartbeatMs = None,
     new: Annotated[
@@ -134,7 +140,9 @@ def set_command(
     before: Before = None,
     restore_from: Annotated[
         Path | None,
-        typer.Option("--restore", metavar="FILE", help="Restore the contents in this file."),
+        typer.Option(
+            "--restore", metavar="FILE", help="Write the previous contents in this file back."
+        ),
     ] = None,
     interface: Interface = "socketcan",
     channel: Channel = "can0",
@@ -143,8 +151,8 @@ def set_command(
 ) -> None:
     """Set a CANopen sensor's cycle and heartbeat and start it; or undo these changes.
 
-    Changes hold until the device is switched off: nothing is stored in it. A device whose changes
-    are undone is left pre-operational, its state after switching it on.
+    The changes are lost when the device is switched off: nothing is stored in it. After --restore
+    the device is pre-operational, its state after switching on.
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork

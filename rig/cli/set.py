@@ -20,18 +20,18 @@ def set_command(
         list[str] | None,
         typer.Argument(
             metavar="KEY=VALUE",
-            help="Keys of the configuration under observers or supervision.",
+            help="New values for keys of the configuration under observers or supervision.",
         ),
     ] = None,
     acknowledge: Annotated[
         bool, typer.Option("--acknowledge", help="Acknowledge the safe state.")
     ] = False,
-    arm: Annotated[
-        bool, typer.Option("--arm", help="Let estimates be valid, with `arming: manual`.")
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the bridge (`arming: manual`).")] = False,
+    disarm: Annotated[
+        bool, typer.Option("--disarm", help="Disarm the bridge: no estimate is valid.")
     ] = False,
-    disarm: Annotated[bool, typer.Option("--disarm", help="Let no estimate be valid.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Change it although `rig check` finds an error.")
+        bool, typer.Option("--force", help="Apply the change although `rig check` finds an error.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

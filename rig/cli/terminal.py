@@ -15,21 +15,23 @@ from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 EXIT_CODES = {
-    OK: "Done.",
+    OK: "The command succeeded.",
     FAILED: "A run ended in its safe state, without a height or with a log that lacks ticks; a "
     "check, replay, tolerance or run of a fleet failed; a run's files are damaged.",
     WRONG_INPUT: "An input is wrong: one line on standard error names file, key, value and what "
     "was expected.",
-    130: "Interrupted by Ctrl-C where there was nothing to end in order.",
+    130: "Interrupted by Ctrl-C. (Ctrl-C ends a run in order, with one of the codes above.)",
 }
 """Exit codes of all commands, with their meanings."""
 
 console = Console(markup=False)
 
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-StrutOfRun = Annotated[str | None, typer.Option(metavar="NAME", help="Which strut of a run.")]
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print the same as JSON, and nothing else.")]
+StrutOfRun = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Strut of the run, if there are several.")
+]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON only.")]
 Interface = Annotated[str, typer.Option(metavar="NAME", help="python-can's name of the interface.")]
 Channel = Annotated[str, typer.Option(metavar="NAME", help="Channel of the interface.")]
 Bitrate = Annotated[int, typer.Option(metavar="BIT/S", min=1, help="Bit rate in bit/s.")]

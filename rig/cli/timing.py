@@ -15,11 +15,13 @@ _MOST_ROWS = 40
 
 
 def timing(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run with --trace.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a run that was recorded with --trace.")
+    ],
     out: SummaryFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """List the missed ticks of a traced run: the part that took longer, and the cause."""
+    """List the missed ticks of a traced run, with the part that took too long, and the cause."""
     from rig.plan.load import plan_of_run
     from rig.run.late_ticks import by_cause, find_late_ticks
     from rig.run.trace import read_trace

@@ -42,27 +42,29 @@ FoxgloveFlag = Annotated[
     bool,
     typer.Option(
         "--foxglove",
-        help="Publish the runs to Foxglove or Lichtblick in place of a page; requires the extra of "
-        "that name.",
+        help="Publish the runs to Foxglove or Lichtblick instead of a page; requires the extra "
+        "`foxglove`.",
     ),
 ]
 
 
 def view(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of runs.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folders.")],
     model: Annotated[
         list[str] | None,
-        typer.Option(metavar="MODEL", help="Draw this model's law too; once for each model."),
+        typer.Option(metavar="MODEL", help="Also draw the law of this model; may be repeated."),
     ] = None,
     port: Port = None,
     control: ControlFlag = False,
     no_browser: Annotated[
         bool,
-        typer.Option("--no-browser", help="Open no browser, only print the address of the page."),
+        typer.Option(
+            "--no-browser", help="Print the address of the page without opening a browser."
+        ),
     ] = False,
     foxglove: FoxgloveFlag = False,
 ) -> None:
-    """Show runs in the browser, while they are written or afterwards; Ctrl-C ends it."""
+    """Show runs in the browser, during the run or afterwards; Ctrl-C ends the program."""
     from dart_model.spec import load_named_model
     from rig.pages.view.server import ViewServer
 

@@ -28,14 +28,14 @@ class TextLayout(_Section):
     """Layout of a text table.
 
     Attributes:
-        separator: One character, ``tab``, or ``whitespace`` for any run of blanks.
-        decimal: Decimal point or comma.
-        encoding: Encoding of the text, by Python's name.
+        separator: One character, ``tab``, or ``whitespace`` for any number of blanks.
+        decimal: Decimal sign: a point or a comma.
+        encoding: Character encoding, by its name in Python.
         skip_lines: Lines before the column names, or before the data where there are no names.
-        column_names: Whether a line with the column names precedes the data.
-        skip_after_names: Lines between the names and the data, e.g. one with units.
-        first_row: First row of data that is taken, counted from 0.
-        rows: Number of rows that are taken; all if absent.
+        column_names: Whether the file has a line with column names.
+        skip_after_names: Lines between the names and the data, such as one with units.
+        first_row: First row of data that is used, counted from 0.
+        rows: Number of rows that are used; all if absent.
     """
 
     separator: Annotated[str, Field(pattern=r"^(.|tab|whitespace)$")] = ","
@@ -60,11 +60,10 @@ class TimeColumn(_Section):
     """When a row was measured: a column of numbers, a column of dates, or a sampling rate.
 
     Attributes:
-        column: Column of the time.
-        unit: Unit of a column of numbers, e.g. ``s`` or ``ms``.
-        date_format: Format of a column of dates, in the letters of C's ``strptime``; ``iso``
-            for ISO 8601.
-        sampling_rate_hz: Rows a second, where there is no column.
+        column: Column of the time, by its name or its number (from 1).
+        unit: Unit of a column of numbers, such as ``s`` or ``ms``.
+        date_format: Format of a column of dates, as for C's ``strptime``, or ``iso`` for ISO 8601.
+        sampling_rate_hz: Rows per second, if the table has no column of times.
     """
 
     column: ColumnName | None = None
@@ -87,9 +86,10 @@ class _Channel(_Section):
     """A measured quantity: gain times reading in `unit`, converted to SI, by its calibration.
 
     Attributes:
-        column: Its column.
-        unit: Unit of gain times reading, e.g. ``mm``, ``kN``, ``lbf``.
-        gain: Units a reading, e.g. of a sensor whose volts were recorded.
+        column: Column of the quantity, by its name or its number (from 1).
+        unit: Unit of the product of gain and reading, such as ``mm``, ``kN``, ``lbf``.
+        gain: Factor on the reading, in `unit` per unit of the table, such as 500 for a sensor with
+            500 N/V whose volts were recorded.
     """
 
     column: ColumnName
@@ -112,9 +112,8 @@ class HeightChannel(_Channel):
     """A height.
 
     Attributes:
-        zero: A reading, in m after the gain, at a known length of the strut; without it the reading
-            is the length.
-        reversed: Whether the sensor reads less while the strut gets longer.
+        zero: A reading at a known length of the strut; without it the reading is the length.
+        reversed: True if the reading falls while the strut gets longer; requires `zero`.
     """
 
     zero: Zero | None = None
@@ -137,8 +136,8 @@ class ForceChannel(_Channel):
     """A force.
 
     Attributes:
-        tare_n: Reading, in N after the gain, without a force.
-        reversed: Whether the table has the opposite sign.
+        tare_n: Reading without a force, in N after the gain.
+        reversed: True if the table has the opposite sign.
     """
 
     tare_n: Finite = 0.0
@@ -154,7 +153,7 @@ class TemperatureChannel(_Channel):
     """A temperature; `offset_k` is added.
 
     Attributes:
-        offset_k: Added to what is read, in K.
+        offset_k: Offset that is added to the reading, in K.
     """
 
     offset_k: Finite = 0.0
@@ -169,12 +168,12 @@ class TableMapping(_Section):
     """The meaning of a foreign table.
 
     Attributes:
-        table: Layout of a text; not read for MF4 files.
-        time: When a row was measured; not read for MF4 files, whose channels have times.
-        height: Strut height, positive apart.
+        table: Layout of a text table; not used for MF4 files.
+        time: Times of the rows; not used for MF4 files, whose channels have times.
+        height: Height of the strut, which grows in rebound.
         applied_force: Force on the body, positive upwards (force-driven bench).
-        strut_force: Load cell, positive when the strut pushes its bodies apart.
-        temperature: Damper temperature.
+        strut_force: Force of the load cell, positive when the strut pushes its ends apart.
+        temperature: Temperature of the damper.
     """
 
     table: TextLayout = TextLayout()

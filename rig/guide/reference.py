@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from can_dbc.units import Dimension
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
@@ -116,27 +117,36 @@ def _observer_keys() -> str:
 
 def _bench_effects() -> str:
     rows = [
-        (f"`{name}`", ", ".join(f"`{parameter.name}`" for parameter in kind.parameters))
+        (f"`{name}`", kind.words, ", ".join(f"`{it.name}`" for it in kind.parameters))
         for name, kind in EFFECT_KINDS.items()
     ]
-    return _table(("Effect", "Parameters"), rows)
+    return _table(("Effect", "Meaning", "Parameters"), rows)
 
 
 def _measured_quantities() -> str:
     rows = [
-        (f"`{item.key}`", item.dimension.value, f"`{item.column}`", item.words)
-        for item in (HEIGHT, *BENCH_QUANTITIES)
+        (f"`{item.key}`", _unit(item.dimension), f"`{prefix}{item.column}`", item.words)
+        for prefix, items in (("STRUT.measured_", (HEIGHT,)), ("", BENCH_QUANTITIES))
+        for item in items
     ]
     return _table(("Key under `signals`", "Unit", "Column of the log", "Meaning"), rows)
 
 
 def _published_quantities() -> str:
     rows = [
-        (f"`{group}`", f"`{item.key}`", item.dimension.value, f"`{item.signal}`")
+        (f"`{group}`", f"`{item.key}`", _unit(item.dimension), f"`{item.signal}`", item.meaning)
         for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
         for item in items
     ]
-    return _table(("Under", "Key", "Unit", "Signal where only a message is given"), rows)
+    return _table(("Under", "Key", "Unit", "Default signal", "Meaning"), rows)
+
+
+_UNITS = {Dimension.NUMBER: "-", Dimension.TEMPERATURE: "°C", Dimension.ACCELERATION: "m/s²"}
+"""Units that a DBC spells in another way than a text."""
+
+
+def _unit(dimension: Dimension) -> str:
+    return _UNITS.get(dimension, dimension.value)
 
 
 def _families() -> str:
@@ -168,12 +178,13 @@ def _effect(item: Effect, pictures: Path) -> str:
         for it in item.parameters[:_MOST_PARAMETERS]
     ]
     more = len(item.parameters) - _MOST_PARAMETERS
-    simpler = f" Degenerates to {', '.join(item.simpler)}." if item.simpler else ""
+    simpler = f" It contains {', '.join(item.simpler)} as a special case." if item.simpler else ""
     parts = [
         f"### {item.name}",
-        f"{item.words}.{simpler} Excitation that shows it: {item.excitation}.",
+        f"{item.words[0].upper()}{item.words[1:]}.{simpler} Required excitation: "
+        f"{item.excitation}.",
         _table(("Parameter", "Unit", "Bounds", "Meaning"), rows),
-        *([f"And {more} more."] if more > 0 else []),
+        *([f"Further parameters: {more}, of the same kind."] if more > 0 else []),
         f"Force, N:\n\n```python\n{_formula('force_n', item.force)}\n```",
     ]
     if item.rate:
@@ -255,15 +266,26 @@ def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str
             first = (inspect.getdoc(sections[0]) or "").partition("\n")[0]
             yield f"{prefix}{name}", "", meaning or first
             rows = [row for section in sections for row in _rows(section, f"{prefix}{name}.")]
-            yield from {row[0]: row for row in rows}.values()
+            yield from _merged(rows)
         else:
             text = "required" if default is PydanticUndefined else _default_text(default)
             yield f"{prefix}{name}", text, meaning
 
 
+def _merged(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """One row for each key of alternative sections, with each of its meanings."""
+    by_key: dict[str, list[tuple[str, str, str]]] = {}
+    for row in rows:
+        by_key.setdefault(row[0], []).append(row)
+    for key, same in by_key.items():
+        yield key, same[0][1], " ".join(dict.fromkeys(meaning for _, _, meaning in same))
+
+
 def _default_text(default: object) -> str:
-    if default is None:
+    if default is None or default in ((), {}):
         return "none"
+    if isinstance(default, tuple):
+        return f"[{', '.join(map(_default_text, cast('tuple[object, ...]', default)))}]"
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 

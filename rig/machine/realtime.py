@@ -32,9 +32,9 @@ class Realtime(BaseModel):
 
     Attributes:
         fifo_priority: Priority under SCHED_FIFO; 0 requests none.
-        lock_memory: Keep all pages in memory.
-        cpu: Core on which the loop runs; the scheduler's choice if absent.
-        spin_s: How long to spin before a deadline where SCHED_FIFO was granted.
+        lock_memory: Lock all pages in memory.
+        cpu: Core on which the loop runs; if absent, the scheduler chooses it.
+        spin_s: Time for which the loop spins before a deadline, if SCHED_FIFO was granted.
         freeze_garbage: Collect garbage before the run and not during it.
     """
 

@@ -183,9 +183,9 @@ class ErrorFilter:
     """The filter of one strut.
 
     Attributes:
-        bandwidth_hz: Corner up to which the residual force is followed.
-        noise_std_m: Standard deviation of the height measurement, quantisation included
-            (a step over the square root of 12).
+        bandwidth_hz: Bandwidth within which the residual force is followed.
+        noise_std_m: Standard deviation of the height measurement, quantisation included (resolution
+            over the square root of 12).
     """
 
     bandwidth_hz: Annotated[Finite, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]

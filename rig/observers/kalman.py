@@ -91,8 +91,8 @@ class KalmanObserver:
     """The noise-aware observer of one strut.
 
     Attributes:
-        kind: Selects this observer: `kalman`.
-        filter: The filter; `rig tune` chooses its bandwidth.
+        kind: `kalman`: the noise-aware observer.
+        filter: Kalman filter of the model's error; `rig tune` chooses its bandwidth.
         force_limit_n: Largest magnitude of the virtual force.
     """
 

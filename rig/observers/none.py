@@ -33,7 +33,7 @@ class NoObserver:
     """A strut without an observer.
 
     Attributes:
-        kind: Selects this observer: `none`.
+        kind: `none`: no observer.
     """
 
     requires_height: ClassVar[bool] = False

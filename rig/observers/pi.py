@@ -88,12 +88,12 @@ class PiObserver:
     """Gains of one strut's observer; the defaults are those of the reference case.
 
     Attributes:
-        kind: Selects this observer: `pi`, the default.
-        proportional_n_per_m: K_P.
-        integral_n_per_m_s: K_I.
-        derivative_n_s_per_m: Gain of the innovation's rate; requires `filter`.
+        kind: `pi`: the PI observer (default).
+        proportional_n_per_m: Proportional gain K_P.
+        integral_n_per_m_s: Integral gain K_I.
+        derivative_n_s_per_m: Derivative gain, on the rate of the innovation; requires `filter`.
         force_limit_n: Largest magnitude of the virtual force.
-        filter: Predicts the present innovation; without one the last is used as it is.
+        filter: Filter that predicts the present innovation; if absent, the last one is used.
     """
 
     requires_height: ClassVar[bool] = True

@@ -82,9 +82,10 @@ class HeightSignal(MeasuredSignal):
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that says whether the sensor measures.
-        delay_s: How much later its frame arrives than it was true: filters of the sensor, its
-            cycle, the bus. The model's height of that time is compared with it.
+        valid: Signal of the same message that shows whether the sensor measures.
+        delay_s: Time from the instant that the value describes to the arrival of its frame, because
+            of the sensor's filter, its cycle and the bus. The value is compared with the model's
+            height at that instant.
     """
 
     delay_s: Annotated[Finite, Field(ge=0, le=1.0)] = 0.0
@@ -128,15 +129,17 @@ def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     fields: dict[str, Any] = {"measures": (Literal[quantity.key], ...), noise.key: (std, ...)}
     name = f"{quantity.key.capitalize()}Sensor"
     settings = create_model(name, __base__=SensorSignal, __module__=__name__, **fields)
+    choices = ", ".join(f"`{key}`" for key in STRUT_QUANTITIES)
     settings.__doc__ = f"""{quantity.words[0].upper()}{quantity.words[1:]}.
 
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that says whether the sensor measures.
+        valid: Signal of the same message that shows whether the sensor measures.
         delay_s: Time from the measurement to the arrival of its frame.
-        measures: What it measures: `{quantity.key}`.
-        {noise.key}: Standard deviation of a reading, quantisation included.
+        measures: Measured quantity of the strut: {choices}.
+        {noise.key}: Standard deviation of a reading, quantisation included, for a sensor that
+            measures a {quantity.key}.
     """
     return settings
 
@@ -186,9 +189,9 @@ class PrescribedMotion(_Frozen):
     """A dyno: the motion is prescribed, the model follows it, and the load cell measures its force.
 
     Attributes:
-        settling_s: Time constant with which older heights fade in the velocity that the model is
-            given; the velocity errs by three times the square of its product with the motion's
-            angular frequency.
+        settling_s: Time constant T of the filter that computes the velocity from the heights. The
+            relative error of the velocity is 3 (T omega)^2 at the angular frequency omega of the
+            motion.
     """
 
     settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = 0.002
@@ -230,11 +233,11 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
 
 
 class Unsafe(_Frozen):
-    """What is refused unless the user takes it upon themselves.
+    """What is refused unless the user accepts the risk.
 
     Attributes:
-        publish_without_valid: Publish a strut's force without the signal that marks it as invalid:
-            a receiver takes the force of a lost estimate for the strut's.
+        publish_without_valid: Publish a strut's force without the signal `valid`. A receiver cannot
+            distinguish the force of a lost estimate from a right one.
     """
 
     publish_without_valid: bool = False
@@ -244,15 +247,15 @@ class LogConfig(_Frozen):
     """How the log of a run is kept.
 
     Attributes:
-        rotate_bytes: Size at which the log is continued in further files; never if absent.
-        rotate_s: Time after which the log is continued in further files; never if absent.
-        capture_before_s: Time before a fault that is kept apart.
-        capture_after_s: Time after the fault that is kept apart.
-        most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
-            a limit that is passed (one that only warns, too), a fault of bus or log, and SIGUSR2.
-        sync_s: Interval at which all that is logged is written to the disk itself: what a loss of
-            power takes at most. Null leaves it to the system, which takes half a minute; so does a
-            simulated run, which can be repeated.
+        rotate_bytes: Size from which the log continues in further files; if absent, it does not.
+        rotate_s: Time after which the log continues in further files; if absent, it does not.
+        capture_before_s: Length of an excerpt before the fault.
+        capture_after_s: Length of an excerpt after the fault.
+        most_captures: Largest number of excerpts around faults in one run. An excerpt is kept at
+            HOLD, SAFE, a value beyond a limit (also with the action `warn`), a fault of the bus or
+            the log, and SIGUSR2.
+        sync_s: Interval at which the log is flushed to the disk (`fsync`), in real time only. With
+            null the operating system decides, after up to half a minute.
     """
 
     rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
@@ -279,31 +282,30 @@ class RunConfig(_Frozen):
     """All of a run's configuration.
 
     Attributes:
-        rate_hz: Ticks a second.
-        duration_s: Length of the run; until Ctrl-C if absent.
-        model: Model file, in the folder of the configuration, or the name of one of the package.
-        engine: What simulates the model.
-        dbc: DBC file in the folder of the configuration; the package's own if absent.
-        bus: How to open the bus.
+        rate_hz: Ticks per second.
+        duration_s: Length of the run; if absent, it lasts until Ctrl-C.
+        model: Model file, from the folder of the configuration on, or the name of a shipped model.
+        engine: Program that simulates the model.
+        dbc: DBC file, from the folder of the configuration on; the package's own if absent.
+        bus: Interface, channel and bit rates of the bus.
         authentication: Authentication of all frames; none if absent.
         signals: Signals that are read from the bus.
         devices: Devices that report their state, by the names of their nodes in the DBC.
-        prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
-        observers: One for each strut of the model, by strut name; PI where none is named.
-            `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.
-        publish: What is published of each strut, by strut name: signals by the keys of
-            `rig.bridge.published_quantities.STRUT`. By default, where the DBC has them,
-            RIG_ESTIMATE and RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for
-            the next ones.
-        status: What is published of the bridge, by the keys of
-            `rig.bridge.published_quantities.STATUS`; or a message that has a signal of each name.
-            By default RIG_STATUS, where the DBC has it.
-        timing: How well the rate is kept, by the keys of
-            `rig.bridge.published_quantities.TIMING`, or a message; nothing by default.
-        supervision: Ages and safe state.
-        unsafe: What is done although a bench can be hurt by it.
-        realtime: What is asked of the machine.
-        log: Rotation, and windows that are kept apart.
+        prescribed_motion: Declares a dyno, which has a load cell and no applied force.
+        observers: Observer of each strut, by strut name; `pi` for a strut without an entry. A dyno
+            uses no observer. The keys of each kind are listed below.
+        publish: Signals that carry the quantities of each strut, by strut name and by the keys of
+            the published quantities. By default RIG_ESTIMATE and RIG_KINEMATICS, if the DBC has
+            them, for the first strut, and these names with _2, _3, ... for the next ones.
+        status: Signals that carry the state of the bridge, by the keys of the published quantities,
+            or the name of a message with the default signals. By default RIG_STATUS, if the DBC has
+            it.
+        timing: Signals that show how well the rate is kept, by the keys of the published
+            quantities, or the name of a message. Nothing by default.
+        supervision: Conditions of a valid estimate, limits and safe state.
+        unsafe: Permissions that may cause damage on a bench.
+        realtime: Real-time conditions that are requested from the operating system.
+        log: Rotation of the log, and excerpts around faults.
     """
 
     rate_hz: Annotated[Finite, Field(ge=0.001, le=100_000)] = 1000.0

@@ -31,9 +31,14 @@ class EffectParameter(NamedTuple):
 
 
 class EffectKind(NamedTuple):
-    """One kind of effect: its law, parameters in the law's order, number of internal states."""
+    """One kind of effect: its law, parameters in the law's order, number of internal states.
+
+    Attributes:
+        words: Its meaning, for the guide.
+    """
 
     law: LawCode
+    words: str
     parameters: tuple[EffectParameter, ...]
     states: int
 
@@ -117,11 +122,37 @@ _PARAMETERS: dict[LawCode, tuple[EffectParameter, ...]] = {
     LawCode.INPUT_GAIN: (EffectParameter("gain"),),
     LawCode.DELAY: (EffectParameter("delay_s", low=0.0, high=1.0),),
 }
+_WORDS: dict[LawCode, str] = {
+    LawCode.PRELOAD: "constant force",
+    LawCode.LINEAR_STIFFNESS: "linear spring",
+    LawCode.QUADRATIC_STIFFNESS: "force with the square of the deflection",
+    LawCode.CUBIC_STIFFNESS: "force with the cube of the deflection",
+    LawCode.PROGRESSIVE_STIFFNESS: "spring that stiffens exponentially",
+    LawCode.GAS_SPRING: "polytropic gas spring",
+    LawCode.BUMP_STOP: "stop in compression (Hunt-Crossley)",
+    LawCode.REBOUND_STOP: "stop in rebound (Hunt-Crossley)",
+    LawCode.BACKLASH: "free play within a spring",
+    LawCode.LINEAR_DAMPING: "linear damper",
+    LawCode.QUADRATIC_DAMPING: "force with the square of the velocity",
+    LawCode.ASYMMETRIC_DAMPING: "linear damper, different in compression and rebound",
+    LawCode.DIGRESSIVE_DAMPING: "damper with a knee",
+    LawCode.POSITION_DEPENDENT_DAMPING: "damping that rises with the square of the deflection",
+    LawCode.FRICTION: "dry friction (LuGre)",
+    LawCode.BOUC_WEN: "hysteresis (Bouc-Wen)",
+    LawCode.MAXWELL: "spring and damper in series",
+    LawCode.PERIODIC_FORCE: "sine force",
+    LawCode.TEMPERATURE_FADE: "fade of the damper with temperature",
+    LawCode.TIME_FADE: "fade of the damper with time",
+    LawCode.HIDDEN_MASS: "further mass on a spring and a damper",
+    LawCode.ADDED_MASS: "further mass on the upper body",
+    LawCode.INPUT_GAIN: "factor on the applied force",
+    LawCode.DELAY: "delay of the applied force",
+}
 _STATES = {LawCode.FRICTION: 1, LawCode.BOUC_WEN: 1, LawCode.MAXWELL: 1, LawCode.HIDDEN_MASS: 2}
 
 EFFECT_KINDS: MappingProxyType[str, EffectKind] = MappingProxyType(
     {
-        law.name.lower(): EffectKind(law, parameters, _STATES.get(law, 0))
+        law.name.lower(): EffectKind(law, _WORDS[law], parameters, _STATES.get(law, 0))
         for law, parameters in _PARAMETERS.items()
     }
 )

@@ -41,7 +41,7 @@ class Mass(_Section):
 
     Attributes:
         name: Name of the body.
-        mass_kg: Its mass in kg.
+        mass_kg: Mass of the body in kg.
     """
 
     name: Name
@@ -94,10 +94,11 @@ class BenchStrut(_Section):
     Attributes:
         name: Name of the strut.
         between: Lower and upper body. Every body is the upper body of exactly one strut.
-        free_length_m: Height from which the laws of undeclared effects count the deflection, in m.
+        free_length_m: Height at which the deflection in the laws of undeclared effects is zero, in
+            m.
         spring: Spring curve.
         damper: Damper curve.
-        initial_height_m: Height at the start in m; the static equilibrium if none is given.
+        initial_height_m: Height at the start in m; the static equilibrium if absent.
     """
 
     name: Name
@@ -112,9 +113,9 @@ class _Sine(_Section):
     """A sine: amplitude * sin(angular frequency * t + phase_rad).
 
     Attributes:
-        kind: Selects this kind of component.
-        frequency_hz: Frequency in Hz, or
-        angular_frequency_rad_per_s: angular frequency in rad/s.
+        kind: `sine`: a sine.
+        frequency_hz: Frequency in Hz; either this or `angular_frequency_rad_per_s` is required.
+        angular_frequency_rad_per_s: Angular frequency in rad/s, instead of `frequency_hz`.
         phase_rad: Phase at time zero in rad.
     """
 
@@ -161,11 +162,11 @@ class _Multisine(_Section):
     """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
 
     Attributes:
-        kind: Selects this kind of component.
+        kind: `multisine`: sines of equal amplitude on equally spaced frequencies.
         low_hz: Lowest frequency in Hz.
         high_hz: Highest frequency in Hz.
         lines: Number of frequencies.
-        seed: Seed of the phases.
+        seed: Seed of the random phases.
     """
 
     kind: Literal["multisine"]
@@ -205,11 +206,11 @@ class _Sweep(_Section):
     """A sine whose frequency runs from one value to another within `duration_s`.
 
     Attributes:
-        kind: Selects this kind of component.
+        kind: `sweep`: a sine whose frequency changes.
         start_hz: Frequency at the start in Hz.
         end_hz: Frequency at the end in Hz.
         duration_s: Time from start to end in s.
-        spacing: How the frequency changes: linear or logarithmic.
+        spacing: Change of the frequency over time: `linear` or `logarithmic`.
     """
 
     kind: Literal["sweep"]
@@ -243,8 +244,9 @@ class _File(_Section):
     """A column of a CSV file over its column `t_s`.
 
     Attributes:
-        kind: Selects this kind of component.
-        path: File, relative to the configuration, within its folder.
+        kind: `file`: a column of a CSV file.
+        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n` or
+            `height_m`.
     """
 
     column: ClassVar[str]
@@ -283,7 +285,7 @@ class AppliedForce(_Section):
     """The force that drives the bench.
 
     Attributes:
-        body: Body on which it acts; None where the bench applies no force.
+        body: Body on which the force acts; absent if no force is applied.
         components: Forces that add up.
     """
 
@@ -306,8 +308,8 @@ class StrutMotion(_Section):
     """A motion that a strut is forced through, whatever force it takes: a damper dyno.
 
     Attributes:
-        strut: BenchStrut whose height is prescribed.
-        mean_height_m: Height about which the components move, in m.
+        strut: Strut whose height is prescribed.
+        mean_height_m: Constant part of the height, to which the components are added, in m.
         components: Motions that add up.
     """
 
@@ -322,8 +324,9 @@ class Temperature(_Section):
     Attributes:
         initial_c: Temperature at the start in degrees Celsius.
         ambient_c: Temperature of the air in degrees Celsius.
-        heat_capacity_j_per_k: Heat capacity; None keeps the damper from warming up.
-        cooling_time_s: Time constant of cooling; None keeps the heat in.
+        heat_capacity_j_per_k: Heat capacity of the damper in J/K; if absent, the temperature is
+            constant.
+        cooling_time_s: Time constant of cooling in s; if absent, the damper does not cool.
     """
 
     initial_c: float = 20.0
@@ -336,9 +339,9 @@ class UndeclaredEffect(_Section):
     """An effect of the bench that no model declares.
 
     Attributes:
-        name: One of `rig.simulated_bench.effects.EFFECT_KINDS`.
-        strut: BenchStrut in which it acts, or whose upper body it changes.
-        parameters: Values by parameter name.
+        name: Name of the effect, from the list of effects.
+        strut: Strut in which the effect acts, or whose upper body it changes.
+        parameters: Values of the effect's parameters, by name.
     """
 
     name: str
@@ -381,7 +384,7 @@ class HeightSensor(_Sensor):
 
     Attributes:
         strut: Strut whose height it measures.
-        offset_m: What it reads above the height, in m: a draw-wire starts at an arbitrary zero.
+        offset_m: Reading at a height of zero, in m, as of a draw-wire with an arbitrary zero.
         noise_std_m: Standard deviation of white noise in m.
     """
 
@@ -399,7 +402,7 @@ class AppliedForceSensor(_Sensor):
     """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise.
 
     Attributes:
-        offset_n: What it reads without a force, in N.
+        offset_n: Reading without a force, in N.
         noise_std_n: Standard deviation of white noise in N.
     """
 
@@ -417,7 +420,7 @@ class LoadCell(_Sensor):
 
     Attributes:
         strut: Strut whose force it measures.
-        offset_n: What it reads without a force, in N.
+        offset_n: Reading without a force, in N.
         noise_std_n: Standard deviation of white noise in N.
     """
 
@@ -445,17 +448,18 @@ class Transmission(_Section):
     """One message of the bench: its sensors, delay and loss.
 
     Attributes:
-        message: Name of the message in the bus's database.
-        period_ns: Time between samples; the database's cycle time if none is given.
-        latency_ns: Time from sample to transmission.
-        jitter_ns: Largest further time, drawn evenly from zero up.
-        loss_probability: Share of frames that never arrive; their counters are missing.
+        message: Message of the DBC.
+        period_ns: Time between samples in ns; the cycle time in the DBC if absent.
+        latency_ns: Time from sample to transmission in ns.
+        jitter_ns: Largest additional delay in ns, uniformly distributed from zero.
+        loss_probability: Probability that a frame is lost; the counter shows the gap.
         height: Height sensor, if the message carries one.
         applied_force: Sensor of the applied force, if the message carries one.
         strut_force: Load cell, if the message carries one.
         temperature: Thermometer, if the message carries one.
-        counter: Signal that counts the frames of a message without protection.
-        time: Signal with the bench's time of the sample, which begins again at its range's end.
+        counter: Signal that counts the frames, for a message without E2E protection.
+        time: Signal with the bench's time of the sample; it restarts at zero at the end of its
+            range.
     """
 
     message: str
@@ -484,16 +488,16 @@ class BenchConfig(_Section):
 
     Attributes:
         name: Name of the bench.
-        gravity_m_per_s2: Acceleration of free fall.
+        gravity_m_per_s2: Gravitational acceleration.
         masses: Bodies.
-        struts: Struts; each carries one body, the lower ends are the world or other bodies.
+        struts: Struts, each of which carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any.
         prescribed_motion: The motion that drives a strut, if any.
-        temperature: The damper's temperature.
-        undeclared_effects: Effects of the bench that no model declares.
+        temperature: Temperature of the damper.
+        undeclared_effects: Effects of the bench that the bridge's model does not contain.
         transmissions: Messages that the bench sends.
-        seed: Seed of noise, jitter and loss.
-        step_ns: Longest step of the integrator.
+        seed: Seed of the random numbers for noise, jitter and loss.
+        step_ns: Longest step of the integrator in ns.
     """
 
     name: Name

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from rig.plan import build
-from tests.bench.test_codec_speed import time_decoding
+from tests.bench.test_codec_speed import FRAMES, REPEATS, time_decoding
 from tests.bench.test_many_struts import OBSERVERS, STANDING, strut_subjects
 from tests.bench.test_tick_speed import (
     ROUNDS,
@@ -26,16 +26,27 @@ from tests.bench.test_tick_speed import (
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = f"""
-CPU time of one tick, in {ROUNDS} rounds of {TICKS} ticks each. The rounds of all subjects of a
-table alternate, and a ratio is that within one round: its median, and in parentheses the 10th and
-90th percentile over the rounds. The measure is the bare DART loop of a moving body: read position
-and velocity, set a force, `World.step`, with DART's array functions or its cheaper scalar ones. The
-loop by hand decodes and encodes with cantools around DART and a PI observer, without a check, a
-mode or a limit. A ratio to DART alone differs by machine; that to the loop by hand, which is mostly
-Python as well, differs less. Times of a live run are on the page of real time.
+The tables give the CPU time of one tick, as the median over {ROUNDS} rounds of {TICKS} ticks. The
+rounds of all rows of a table alternate. Each ratio is formed within one round; the tables give its
+median over the rounds, with the 10th and 90th percentile in parentheses. It therefore differs from
+the ratio of the two medians.
+
+- *DART, scalar functions* and *DART, array functions*: bare DART loops with a moving body, which
+  read position and velocity, set a force and call `World.step`, with DART's cheaper scalar
+  functions or its array functions.
+- *Plant alone*: DART with the bridge's third-order integrator.
+- *Plant, observer and supervisor*: the same with a PI observer and the supervision of the mode,
+  without frames.
+- *Whole tick of the bridge*: one frame is decoded and checked, one frame is sent.
+- *Hand-written loop*: it decodes a frame with cantools, steps DART with a PI observer, and encodes
+  a frame, without checks, modes or limits.
+
+Ratios to DART alone vary from machine to machine; those to the hand-written loop, which like the
+bridge is mostly Python, vary less. For times of a live run see [In real time](real-time.md).
 """
 SCALAR, ARRAY = "DART, scalar functions", "DART, array functions"
-BY_HAND = "cantools, DART and a PI by hand"
+BY_HAND = "hand-written loop"
+_LABELS = {"PI": "`pi`", "noise-aware": "noise-aware (`kalman`)"}
 
 
 def compare(found: Mapping[str, np.ndarray]) -> str:
@@ -45,7 +56,8 @@ def compare(found: Mapping[str, np.ndarray]) -> str:
         (name, f"{np.median(times):.2f}", *(_spread(*ratio[name]) for ratio in over))
         for name, times in found.items()
     ]
-    heads = ("a tick of", "µs", "to scalar DART", "to array DART", "to the loop by hand")
+    references = ("DART, scalar", "DART, array", "the hand-written loop")
+    heads = ("one tick of", "median, µs", *(f"ratio to {name}" for name in references))
     return table(heads, rows)
 
 
@@ -61,7 +73,7 @@ def compare_struts(folder: Path) -> str:
     for kind in OBSERVERS:
         one, four = (f"{kind}, {number}" for number in ("one strut", "four struts"))
         times = (f"{np.median(found[name]):.1f}" for name in (one, four))
-        rows.append((kind, *times, _spread(*ratios(found, one)[four])))
+        rows.append((_LABELS[kind], *times, _spread(*ratios(found, one)[four])))
     return table(("observer", "one strut, µs", "four struts, µs", "ratio"), rows)
 
 
@@ -70,10 +82,12 @@ def describe_logs(folder: Path) -> str:
     cantools_us, frame_us, log_us = time_decoding()
     replay_us, by_hand_us = time_replays(folder)
     return (
-        f"A whole log is decoded {cantools_us / log_us:.0f} times as fast as by cantools frame by "
-        f"frame, and a single frame {cantools_us / frame_us:.1f} times as fast. A logged run is "
-        f"replayed, bit for bit, at {1e6 / replay_us:.0f} ticks a second of one core; a tick of it "
-        f"takes {replay_us / by_hand_us:.1f} times as long as the loop by hand."
+        f"Decoding a log of {FRAMES} frames at once is {cantools_us / log_us:.0f} times as fast as "
+        "decoding it frame by frame with cantools; decoding a single frame is "
+        f"{cantools_us / frame_us:.1f} times as fast (fastest of {REPEATS} repeats). A replay that "
+        f"reproduces the log of a run bit for bit computes {1e6 / replay_us:.0f} ticks per second "
+        f"on one core; one of its ticks takes {replay_us / by_hand_us:.1f} times as long as one of "
+        "the hand-written loop (fastest of five rounds)."
     )
 
 
@@ -85,9 +99,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         parts = [
             compare(time_rounds(tick_subjects())),
-            "With an observer, and nothing else:",
+            "The bare DART loops with a PI observer added, and nothing else:",
             compare(time_rounds(observer_subjects())),
-            "Four struts of a full car compared with one, without the cost of their model:",
+            "Whole ticks with four struts of a full car, compared with one strut. The model is "
+            "replaced by one that computes nothing, so that these times are smaller than those "
+            "above:",
             compare_struts(Path(folder)),
             describe_logs(Path(folder)),
         ]

@@ -244,36 +244,36 @@ def tick_subjects() -> dict[str, Subject]:
     return {
         "DART, array functions": array_loop(observing=False),
         "DART, scalar functions": scalar_loop(observing=False),
-        "third-order plant": plant_ticks,
-        "core step": core_steps("reference", (0.4,), observing=True),
-        "whole tick, frame in and frame out": whole_ticks(),
-        "cantools, DART and a PI by hand": hand_written_loop(),
+        "plant alone": plant_ticks,
+        "plant, observer and supervisor": core_steps("reference", (0.4,), observing=True),
+        "whole tick of the bridge": whole_ticks(),
+        "hand-written loop": hand_written_loop(),
     }
 
 
 def test_a_whole_tick_against_the_bare_dart_loop(capsys):
     found = compare_rounds(tick_subjects(), capsys)
-    tick = found["whole tick, frame in and frame out"]
-    assert np.median(tick / found["cantools, DART and a PI by hand"]) <= 2.6  # measured: 1.9 to 2.0
+    tick = found["whole tick of the bridge"]
+    assert np.median(tick / found["hand-written loop"]) <= 2.6  # measured: 1.9 to 2.0
 
 
 def observer_subjects() -> dict[str, Subject]:
     """DART alone, and with an observer."""
     return {
         "DART, array functions": array_loop(observing=False),
-        "the same with an observer": array_loop(observing=True),
+        "DART, array functions, with an observer": array_loop(observing=True),
         "DART, scalar functions": scalar_loop(observing=False),
-        "these with an observer": scalar_loop(observing=True),
-        "cantools, DART and a PI by hand": hand_written_loop(),
+        "DART, scalar functions, with an observer": scalar_loop(observing=True),
+        "hand-written loop": hand_written_loop(),
     }
 
 
 def test_an_observer_adds_a_fraction_of_the_loop_by_hand(capsys):
     """Against DART alone its share was 1.19 on one machine and 1.36 on another."""
     found = compare_rounds(observer_subjects(), capsys)
-    by_hand = found["cantools, DART and a PI by hand"]
-    arrays = found["the same with an observer"] - found["DART, array functions"]
-    scalars = found["these with an observer"] - found["DART, scalar functions"]
+    by_hand = found["hand-written loop"]
+    arrays = found["DART, array functions, with an observer"] - found["DART, array functions"]
+    scalars = found["DART, scalar functions, with an observer"] - found["DART, scalar functions"]
     # Measured: 0.05 to 0.09, the innovation's own value included.
     assert np.median(arrays / by_hand) < 0.2
     assert np.median(scalars / by_hand) < 0.2

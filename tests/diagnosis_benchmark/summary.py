@@ -36,17 +36,26 @@ is named there is counted apart."""
 
 
 TEXT = f"""
-Recordings are simulated on benches whose truth is known, by a generator with its own equations of
-motion. Each case plants no effect, one, or several, on a bench or a dyno, with an exact or a rough
-nominal model. The whole benchmark also has formulas that the catalogue does not hold, and forces
-that no law describes; the table has the groups that were run. A case is right where `rig diagnose`
-names the planted families as missing (a single one first), where a partial or ambiguous result
-contains them, or where nothing is planted and at most linear corrections of a rough model are
-named. Where no law describes the planted force, a result is right that claims neither that laws
-explain it nor that nothing is missing. The held-out error of an `explained` case is held against
-{EXPLAINED_MULTIPLE} times that of a right model (on a dyno, against the noise floor that the
-diagnosis reports). Shares have their 95 % interval after Wilson. The rows in italics count several
-groups together.
+Recordings are simulated on benches with known truth, by a generator with its own equations of
+motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno; the
+nominal model is exact (apart from these effects) or rough. The whole benchmark also contains
+formulas that are not in the catalogue (`foreign`) and forces that no law describes (`outside`); the
+table contains the groups that were run.
+
+A case counts as right if
+
+- `rig diagnose` names the planted families as missing (a single one first),
+- or a partial or ambiguous result contains them,
+- or nothing is planted, and at most linear corrections of a rough model are named,
+- or no law describes the planted force, and the result claims neither that laws explain it nor that
+  nothing is missing.
+
+The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
+right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
+`False names` is the share of cases in which an effect is named that was not planted, `not bound`
+the share in which the data do not exclude that a named effect has the size zero. Shares are given
+with their 95 % interval after Wilson. A group that ends with `complete` has no planted effect; one
+that begins with `rough` has a rough nominal model. The rows in italics combine several groups.
 """
 
 
@@ -195,10 +204,10 @@ COLUMNS = (
     Column("right", lambda found: str(found["right"])),
     Column("false names", lambda found: str(found["false_names"])),
     Column("not bound", lambda found: str(found["unbound"])),
-    Column(f"`explained` within {EXPLAINED_MULTIPLE} floors", _explained),
-    Column("95 % intervals that hold", lambda found: f"{found['coverage']}"),
-    Column("s median", _decimal("seconds_median", ".1f")),
-    Column("s worst", _decimal("seconds_worst", ".1f")),
+    Column(f"`explained` within {EXPLAINED_MULTIPLE} noise floors", _explained),
+    Column("95 % intervals that contain the truth", lambda found: f"{found['coverage']}"),
+    Column("median duration, s", _decimal("seconds_median", ".1f")),
+    Column("longest duration, s", _decimal("seconds_worst", ".1f")),
 )
 
 

@@ -10,11 +10,12 @@ from tests.dyno.dynos import drawn, found
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
-{cases} sine records of dampers are drawn at random, by the laws {laws}. Noise is white.
-`rig characterise` computes the figures of each record with 95 % intervals, and the true values are
-known. The table has the share of the intervals that hold the truth, over all laws and by law, and
-in parentheses the median half width over the value, unless the value is zero. Correlated noise, and
-the errors of a real sensor, are not in this study.
+{cases} records of dampers in sine tests are drawn at random, with one of the laws {laws}, and with
+white noise. `rig characterise` computes the figures of each record with 95 % intervals; the true
+values are known. The table gives the share of the intervals that contain the true value, over all
+laws and for each law. In parentheses it gives the median half width of the interval, relative to
+the value, unless the value is zero. Correlated noise and the errors of a real sensor are not part
+of this study.
 """
 
 
@@ -65,7 +66,7 @@ def write_page(hits, cases):
     ]
     write_evidence(
         "dyno-intervals",
-        "Intervals of a damper's figures",
+        "How often the intervals of a damper's figures are right",
         TEXT.format(cases=cases, laws=", ".join(laws)),
         [table(("figure", "all", *laws), rows)],
         command_line(),

@@ -192,22 +192,23 @@ def one(job):
 
 
 TEXT = """
-`rig characterise --master` names what is wrong with a damper, compared with a good one of the same
-test. Here the dampers are simulated, by equations of their own: a polytropic gas column, a law of
-damping with a sharp knee, oil whose stiffness rises with pressure, play as a contact. Gas force,
-friction, damping below and above the knee and the knee's speed, in each direction, scatter by
-{scatter:g} % (standard deviation) from damper to damper, and the master is one without scatter.
-Half of the dampers are good, the others have one fault each, of a random size. A fault that is not
-in this list is not part of the test.
+`rig characterise --master` compares a damper with a good one of the same test, and names its fault.
+Here the dampers are simulated with their own equations: a polytropic gas column, a damping law with
+a sharp knee, oil whose stiffness rises with pressure, and a contact as play.
+
+Gas force, friction, damping below and above the knee, and the speed of the knee scatter by
+{scatter:g} % (standard deviation) from damper to damper, in each direction; the master has no
+scatter. Half of the dampers are good. Each of the others has one fault of a random size. Other
+faults than those in the table were not tested.
 """
 
 PLANTED = {
-    "good": "nothing",
-    "gas pressure": "gas pressure, 20 to 80 % of it lost",
-    "seal friction": "seal friction, 15 to 80 N more",
+    "good": "none (good damper)",
+    "gas pressure": "gas pressure, a loss of 20 to 80 %",
+    "seal friction": "seal friction, an increase of 15 to 80 N",
     "air in the oil": "air in the oil, 0.2 to 1 mm/kN at low pressure",
     "play": "play, 0.2 to 1 mm",
-    "another damping": "damping, 20 to 50 % less at all speeds in one direction or both",
+    "another damping": "damping, a loss of 20 to 50 % at all speeds, in one direction or both",
     "blow-off early": "blow-off at a speed 25 to 60 % lower, in one direction or both",
 }
 """What `FAULTS` draws."""
@@ -283,10 +284,10 @@ def row_of(fault: str, counts: Counter[str]) -> tuple[object, ...]:
 
 def write_page(found: Mapping[str, Counter[str]]) -> None:
     """Write the guide's page."""
-    heads = ("planted", "dampers", "named right", "named otherwise", "interval holds the size")
+    heads = ("fault", "dampers", "named correctly", "otherwise", "interval contains the size")
     write_evidence(
         "dyno-faults",
-        "Faults of a damper",
+        "How often a damper's fault is named correctly",
         TEXT.format(scatter=100 * SCATTER),
         [table(heads, [row_of(*item) for item in found.items()])],
         command_line(),

@@ -15,22 +15,27 @@ from tests.evidence import add_page_option, command_line, write_evidence
 FOLDER = Path(__file__).parent
 
 FAULTS_TEXT = """
-The bridge runs at 1 kHz with the bench of the reference case, and each row is one fault that a test
-puts between them, or into the machine. Faults of frames, bench and devices are injected tick by
-tick in simulated time, 2 s after the start; those of disk and process are real runs. `Within` is
-the time from the fault to the first tick that shows it, or to the state that is named. A force
-error is the RMS difference to the simulated bench over the valid ticks, compared with the same run
-without the fault. Faults in combination are not in this table.
+The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
+fault. Faults of frames, bench and devices are injected in simulated time, 2 s after the start;
+faults of disk and process in real runs. `Within` is the time from the fault to the first tick that
+shows it, or to the state that is named. The force error is the RMS difference to the simulated
+bench over the valid ticks; it is compared with that of the same run without the fault. Combinations
+of faults are not in this table.
 """
 
 PROMISE_TEXT = """
-A node on the bus decodes the bridge's frames with cantools; neither the log nor the bridge's own
-values are used. The bench is the reference case, in simulated time, and most events begin 2 s after
-the start. No force with `VALID` = 1 may err by more than three times the largest error of the
-settled run; the test fails otherwise. Modes and times are those of the noise-aware observer. The
-largest valid error is over that of the settled run, for published PI, damped PI and noise-aware
-observer. The rows about signals are of real processes at 100 Hz with a bus in a network of their
-own, and only `VALID` is decoded there. The last column is what the bench has to do itself.
+A node on the bus decodes the bridge's frames with cantools; neither the log nor internal values of
+the bridge are used. The bench is the reference case in simulated time, and most events begin 2 s
+after the start. The test fails if a force with `VALID` = 1 has an error of more than three times
+the largest error of the settled run.
+
+- *First invalid frame* and *valid again* are times since the event; these and the modes are those
+  of the noise-aware observer.
+- *Largest valid error* is relative to that of the settled run, for the PI observer with the
+  published gains / a damped PI observer / the noise-aware observer.
+- The events with signals (the last rows) are real processes at 100 Hz with a bus in a separate
+  network; only `VALID` is decoded.
+- The last column states what the bench itself has to do.
 """
 
 
@@ -60,8 +65,10 @@ def main() -> int:
         code, faults, promise = measure(Path(folder))
     print(faults, promise, sep="\n\n")
     if given.page and code == 0:
-        title = "What VALID promises"
-        write_evidence("faults", "Faults", FAULTS_TEXT, [faults], command_line())
+        title = "What VALID promises: the evidence"
+        write_evidence(
+            "faults", "Measured reactions to faults", FAULTS_TEXT, [faults], command_line()
+        )
         write_evidence("promise", title, PROMISE_TEXT, [promise], command_line())
     return code
 

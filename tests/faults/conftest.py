@@ -25,7 +25,7 @@ class Row(NamedTuple):
     lost: str
 
 
-_HEAD = ("Fault", "What the bridge does", "Within", "What is lost")
+_HEAD = ("Fault", "Reaction of the bridge", "Within", "Loss")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -62,10 +62,10 @@ def row(rows: list[Row]) -> Callable[..., None]:
 _PROMISE = (
     "Event",
     "Modes",
-    "First frame invalid",
+    "First invalid frame",
     "Valid again",
     "Largest valid error",
-    "The bench",
+    "Duty of the bench",
 )
 
 

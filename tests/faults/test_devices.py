@@ -122,11 +122,11 @@ def test_an_emergency(row):
     row(
         31,
         "emergency of a CANopen device (EMCY) that sends the height",
-        "refuses its frames, estimate invalid (HOLD), MEASUREMENT_FAULT; valid again when it has "
-        "settled after the device reported the error's end, the safe state if that takes longer "
-        "than 0.5 s",
+        "refuses its frames, estimate invalid (HOLD), MEASUREMENT_FAULT; after the device has "
+        "reported the end of the error, the estimate settles and is valid again; the safe state if "
+        "the error lasts longer than 0.5 s",
         found_ms,
-        "what the device sends meanwhile",
+        "the frames of this time",
     )
 
 
@@ -138,10 +138,10 @@ def test_a_lost_heartbeat(row):
     assert found_ms == pytest.approx(151, abs=1)
     row(
         32,
-        "lost heartbeat of a CANopen device (`heartbeat_s: 0.25`), its measurements go on",
-        "the same",
-        "250 ms after the last one",
-        "what the device sends from then on",
+        "a CANopen device sends no heartbeat any more (`heartbeat_s: 0.25`), but its measurements",
+        "as after an emergency",
+        "250 ms after the last heartbeat",
+        "the frames from then on",
     )
 
 
@@ -177,9 +177,9 @@ def test_an_alarm_in_the_measurement_itself(row):
     row(
         33,
         "alarm of a device in the measurement's own frame (`alarms`)",
-        "refuses that very frame, and the same",
+        "refuses this frame; then as after an emergency",
         first_ms(ticks, lambda tick: tick.mode is Mode.HOLD),
-        "what the device sends meanwhile",
+        "the frames of this time",
     )
 
 
@@ -200,8 +200,9 @@ def test_a_payload_of_another_length(row):
     assert ticks[-1].counts.wrong_length == END_MS - BEGIN_MS
     row(
         34,
-        "frames of another length (a PDO that was mapped again)",
-        "refuses and counts each (`wrong_length`); estimate invalid (HOLD), then the safe state",
+        "frames whose length differs from the DBC (the PDO mapping was changed)",
+        "refuses and counts each frame (`wrong_length`); estimate invalid (HOLD), then the safe "
+        "state",
         found_ms,
         "the frames",
     )

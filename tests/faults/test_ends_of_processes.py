@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
-ALONE = "where there is no watchdog, notice that the frames stop"
+ALONE = "without a watchdog, detect that the frames stop"
 SIGNALS = ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGHUP", "SIGINT")
 
 

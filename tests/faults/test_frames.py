@@ -64,7 +64,7 @@ def test_loss(row, undisturbed_n):
     row(
         1,
         "loss: 10 % of the measurements",
-        f"continues, counts every one ({ticks[-1].counts.lost}); force error {error_n:.1f} N "
+        f"counts every lost frame ({ticks[-1].counts.lost}); force error {error_n:.1f} N "
         f"instead of {undisturbed_n:.1f} N RMS",
         first_ms(ticks, lambda tick: tick.counts.lost > 0),
         NOTHING_RECEIVED,
@@ -80,7 +80,7 @@ def test_repetition(row, undisturbed_n):
     row(
         2,
         "repetition: every measurement twice",
-        "refuses and counts every second one; the estimate is the same bit for bit",
+        "refuses and counts every repetition; the estimate does not change, bit for bit",
         first_ms(ticks, lambda tick: tick.counts.repeated > 0),
         "the repetitions",
     )
@@ -106,7 +106,7 @@ def test_reordering(row, undisturbed_n):
         f"refuses the late ones and counts them; force error {error_n:.1f} N "
         f"instead of {undisturbed_n:.1f} N RMS",
         first_ms(ticks, lambda tick: tick.counts.out_of_sequence > 0),
-        "the overtaken frames",
+        "the refused frames",
     )
 
 
@@ -128,10 +128,10 @@ def test_delay(row, undisturbed_n):
     assert error_n < 5.0 * undisturbed_n
     row(
         4,
-        "delay: everything 3 ms later from a moment on, stamped on arrival",
-        f"refuses {refused} frames, which contradict their sender's clock, and the estimate "
-        "settles again; then the delay is taken for the sender's: force error "
-        f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (`delay_s`)",
+        "delay: from a moment on, all frames arrive 3 ms later, stamped on arrival",
+        f"refuses {refused} frames that contradict their sender's clock, and the estimate settles "
+        "again; then the delay is attributed to the sender: force error "
+        f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (state it with `delay_s`)",
         first_ms(ticks, lambda tick: not tick.is_valid),
         "the refused frames",
     )
@@ -144,8 +144,8 @@ def test_held_back(row, undisturbed_n):
     assert error_n == pytest.approx(undisturbed_n, rel=0.05)
     row(
         4,
-        "frames held back for 8 ms, four times a second, stamped on arrival",
-        "uses each at its own time, by its sender's clock, and is in SETTLING until then; force "
+        "frames delayed by 8 ms, four times per second, stamped on arrival",
+        "is in SETTLING until they arrive, and uses each at the time of its sample; force "
         f"error {error_n:.1f} N instead of {undisturbed_n:.1f} N RMS",
         first_ms(ticks, lambda tick: not tick.is_valid),
         "nothing",
@@ -212,7 +212,7 @@ def test_masquerade(row):
     row(
         7,
         "masquerade: another message's frames under the measurement's id",
-        "recognises the other message by its data id, refuses and counts",
+        "recognises the other message by its data id, refuses and counts its frames",
         first_ms(ticks, lambda tick: tick.counts.masquerade > 0),
         "the disguised frames",
     )
@@ -232,10 +232,10 @@ def test_a_second_sender_of_the_benchs_id(row):
     row(
         8,
         "a second sender of the bench's id, with valid frames",
-        "believes one of the two, refuses the other's frames, reports a second sender "
+        "uses the frames of one of the two, refuses those of the other, reports a second sender "
         "(BUS_FAULT in RIG_STATUS)",
         found_ms,
-        "the frames of one of the two",
+        "the refused frames",
     )
 
 
@@ -284,10 +284,11 @@ def test_flood(row):
         10,
         f"flood: {sent} random frames in a second under the measurement's id (with limits on range "
         "and rate of the height)",
-        f"{sent - counts.wrong_crc - counts.masquerade} pass the CRC, {counts.implausible} of them "
-        f"the counter and not the limits, {len(wrong)} are used; force error {error_n:.1f} N RMS",
+        f"{sent - counts.wrong_crc - counts.masquerade} pass the CRC; {counts.implausible} of "
+        "these also pass the counter and are refused by the limits; "
+        f"{len(wrong)} are used; force error {error_n:.1f} N RMS",
         first_ms(ticks, lambda tick: tick.counts.refused > 0),
-        "measurements for 3 ms after each frame that passes CRC and counter",
+        "the measurements of 3 ms after each frame that passes CRC and counter",
     )
 
 
@@ -312,7 +313,7 @@ def test_stuck_value(row):
         f"refuses the measurement; estimate invalid after {hold_ms:.0f} ms (HOLD), "
         "then the safe state",
         safe_ms,
-        "the stuck measurements",
+        "the refused measurements",
     )
 
 
@@ -325,7 +326,7 @@ def test_dead_bench(row):
     assert ticks[-1].force_n == 0.0
     row(
         12,
-        "dead bench: no more frames",
+        "the bench stops sending",
         f"estimate invalid after {hold_ms:.0f} ms (HOLD), then the safe state: force 0, invalid, "
         "until acknowledged",
         first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),

@@ -127,9 +127,9 @@ def test_bus_off(row):
         13,
         "bus-off for 200 ms",
         f"BUS_FAULT, estimate invalid after {hold_ms:.0f} ms (HOLD); the controller's restart is "
-        f"recognised, valid again when it has settled, {back_ms - 200:.0f} ms after it",
+        f"detected; the estimate is valid again when it has settled, {back_ms - 200:.0f} ms later",
         first_ms(ticks, lambda tick: tick.counts.bus_faulty > 0),
-        "what the bench sent meanwhile",
+        "the frames of this time",
     )
 
 
@@ -150,11 +150,11 @@ def test_link_down(row):
     row(
         14,
         "link down for 300 ms (`ip link down/up`, adapter unplugged)",
-        f"BUS_FAULT, HOLD after {hold_ms:.0f} ms; tries the interface after 50, 100, 200, ... ms, "
-        f"at least once a second (here back {late_ms:.0f} ms after it was up); the gap stands in "
-        "`run.yaml`",
+        f"BUS_FAULT, HOLD after {hold_ms:.0f} ms; tries to open the interface after 50, 100, 200, "
+        f"... ms, then once a second (here opened {late_ms:.0f} ms after it was up); the gap is "
+        "recorded in `run.yaml`",
         first_ms(ticks, lambda tick: tick.counts.bus_faulty > 0),
-        "what the bench sent meanwhile",
+        "the frames of this time",
     )
 
 
@@ -177,9 +177,9 @@ def test_clock_jump(row, step_s):
     if step_s > 0:
         row(
             19,
-            "clock jump: the system's clock set by an hour, forwards and backwards",
-            "nothing: the run's clock is monotonic, and the frames' stamps are taken again from "
-            "it; counted in `run.yaml`",
+            "the system's clock is set by an hour, forwards or backwards",
+            "none: the run's clock is monotonic, and the frames' time stamps are converted to it; "
+            "counted in `run.yaml`",
             "0 ms",
             "nothing",
         )
@@ -217,11 +217,11 @@ def test_disk_full(row, tmp_path):
     assert replay(tmp_path / "run").different == 0
     row(
         15,
-        "disk full in the middle of a run",
-        "continues, LOG_FAULT; what was written stays whole and replays; ticks wait in memory (two "
-        "minutes at 1 kHz) and are written when there is space again",
+        "the disk is full during a run",
+        "continues, LOG_FAULT; the written part remains complete and can be replayed; ticks wait "
+        "in memory (two minutes at 1 kHz) and are written when there is space again",
         "1 ms",
-        "what was not written when the run ended; its number stands in `run.yaml`",
+        "the ticks that were not written when the run ended; `run.yaml` contains their number",
     )
 
 
@@ -291,8 +291,8 @@ def test_slow_disk(row, tmp_path, monkeypatch):
     assert replay(tmp_path / "run").different == 0
     row(
         16,
-        "slow disk: writing stands still for a second",
-        "no tick waits for it: a thread of its own writes; LOG_FAULT when 2 000 ticks wait",
+        "slow disk: a write takes one second",
+        "no tick waits, because a separate thread writes; LOG_FAULT from 2 000 waiting ticks on",
         "0 ms",
         "nothing",
     )
@@ -332,8 +332,8 @@ def test_sigkill(row, tmp_path):
     row(
         17,
         "SIGKILL",
-        f"ends; frames are on the disk up to 10 ms before, and the steps after the last batch "
-        f"(here {recomputed_ms:.0f} ms) are computed again from them",
+        "the process ends; all frames but those of the last 10 ms are on the disk, and a replay "
+        f"computes the steps after the last batch (here {recomputed_ms:.0f} ms) from them",
         "0 ms",
         "frames of the last 10 ms",
     )
@@ -345,4 +345,10 @@ def test_sigterm(row, tmp_path):
     # A machine that stands still for half a second leads to the safe state, and as orderly an end.
     assert ending["status"] == ("safe" if ending["mode"] == "SAFE" else "done")
     assert replay(tmp_path / "demo" / "run").different == 0
-    row(18, "SIGTERM", "ends in order: log closed, `run.yaml` with its end", "one tick", "nothing")
+    row(
+        18,
+        "SIGTERM",
+        "ends in order: the log is closed, `run.yaml` states the end",
+        "one tick",
+        "nothing",
+    )

@@ -201,18 +201,18 @@ def disk_full(ms):
     return acknowledged(ms)._replace(log_fault=is_full)
 
 
-STOP = "stop using the force while VALID is 0"
+STOP = "do not use the force while VALID is 0"
 EVENTS = [
     Event("frames missing for 5 ms", frames=missing(5)),
     Event("frames missing for 100 ms", STOP, missing(100)),
     Event("frames missing for 200 ms", STOP, missing(200)),
     Event("frames missing for 1 s, then acknowledged", STOP, missing(1000), acknowledged),
-    Event("frames held back for 8 ms, every 2 s (a gateway)", frames=gateway(8, 2000)),
-    Event("frames held back for 20 ms, every 2 s", STOP, gateway(20, 2000)),
+    Event("frames delayed by 8 ms in a gateway, every 2 s", frames=gateway(8, 2000)),
+    Event("frames delayed by 20 ms in a gateway, every 2 s", STOP, gateway(20, 2000)),
     Event("the loop stands still for 100 ms", STOP, missed=range(BEGIN_MS, BEGIN_MS + 100)),
     Event(
         "the loop stands still for 2 s (suspend), then acknowledged",
-        "as above; where there is no watchdog, notice that the frames stop",
+        "do not use the force while VALID is 0; without a watchdog, detect that the frames stop",
         conditions=acknowledged,
         missed=range(BEGIN_MS, BEGIN_MS + 2000),
     ),
@@ -390,8 +390,11 @@ def test_a_scale_that_is_wrong_by_two(scale, promise):
         received = follow(trial, Event("", frames=with_scale(scale)))
         assert not any(it.is_valid for it in received)
     if scale == 2.0:
-        words = f"a height's scale is wrong by two, from the start (limit `{CELL_LIMIT['value']}`)"
-        duty = "have a load cell, or compare a known displacement before the run"
+        words = (
+            "the scale of the height is wrong by a factor of two, from the start "
+            f"(limit `{CELL_LIMIT['value']}`)"
+        )
+        duty = "use a load cell, or check a known displacement before the run"
         promise(
             60,
             words,
@@ -418,7 +421,7 @@ def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
 
     found = reaction(receive, truth_n, settled_n, first_ms)
     if first_ms == 1200:
-        promise(-2, "the bridge joins a bench that moves", *found, STOP)
+        promise(-2, "the bridge joins a moving bench", *found, STOP)
 
 
 def test_an_interlock_that_opens(promise, truth_n, settled_n):
@@ -433,7 +436,7 @@ def test_an_interlock_that_opens(promise, truth_n, settled_n):
         return follow(trial, Event("", frames=frames, conditions=acknowledged))
 
     words = "the interlock opens for 300 ms, then acknowledged"
-    duty = "be switched off by hardware itself"
+    duty = "switch off by hardware"
     promise(50, words, *reaction(receive, truth_n, settled_n), duty)
 
 
@@ -460,7 +463,7 @@ def test_an_applied_force_of_its_own_message_that_stops(promise, truth_n, settle
 
         return follow(trial, Event("", frames=frames))
 
-    words = "the applied force has a message of its own, which stops for 300 ms"
+    words = "the applied force is in a separate message, which stops for 300 ms"
     promise(40, words, *reaction(receive, truth_n, settled_n), STOP)
 
 

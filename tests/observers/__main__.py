@@ -174,8 +174,8 @@ def reference_table(seeds):
     print("reference case through CAN, force error RMS over the peak in %, after 0.5 s")
     rows = {}
     for name, noise_m, step_m in (
-        ("exact, 2 um steps", 0.0, 2e-6),
-        ("20 um noise, 15 um steps", 20e-6, 15e-6),
+        ("exact, resolution 2 um", 0.0, 2e-6),
+        ("noise 20 um, resolution 15 um", 20e-6, 15e-6),
     ):
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary)
@@ -267,20 +267,22 @@ def moving_table(seeds):
 
 
 TEXT = """
-The force error is the RMS difference between the estimated force and the simulated bench's own.
-Compared are the published PI observer, a PI observer and a noise-aware observer tuned as `rig tune`
-does, and the force smoothed after the run. Tuned gains come from one run and are evaluated on runs
-with other noise; those of the tables of latency and of a bridge that joins are fixed. The tables
-with runs through CAN use the shipped reference case. The grid has benches of other masses and
-natural frequencies, whose spring hardens and whose damper bends; their linear model is a quarter
-too soft and half as damped. All benches are simulated: errors of real sensors beyond white noise,
-resolution and latency are not in these figures.
+The force error is the RMS difference between the estimated force and that of the simulated bench.
+Four estimates are compared: the PI observer with the published gains, a PI observer and a
+noise-aware observer that are tuned as by `rig tune`, and the force smoothed after the run. An
+observer is tuned on one run and evaluated on runs with other noise; in the tables of latency and of
+a bridge that joins a moving bench, the gains are fixed.
+
+The runs over CAN use the shipped reference case. The benches of the grid have other masses and
+natural frequencies, a spring that hardens and a damper with a knee; their linear model has three
+quarters of the stiffness and half of the damping. All benches are simulated: errors of real
+sensors, other than white noise, resolution and latency, are not included.
 """
 NAMES = {
     "paper": "published gains",
     "pi": "tuned PI",
     "kalman": "noise-aware",
-    "smoothed": "smoothed afterwards",
+    "smoothed": "smoothed after the run",
 }
 
 
@@ -291,22 +293,26 @@ def reference_part(rows, seeds):
         for name, row in rows.items()
     ]
     words = (
-        f"Reference case through CAN, 20 s, force error over the peak (medians of {seeds} seeds):"
+        "Reference case over CAN, 20 s: force error relative to the peak force "
+        f"(medians of {seeds} seeds):"
     )
     return [words, table(heads, cells)]
 
 
 def latency_part(rows):
-    words = "Reference case, heights 5 ms old and exact, one seed, force error over the peak:"
+    words = (
+        "Reference case with exact heights that are 5 ms old, one seed: force error relative to "
+        "the peak force (`latency configured`: `delay_s: 0.005`):"
+    )
     cells = [(name, _percent(value)) for name, value in rows.items()]
     return [words, table(("observer", "error"), cells)]
 
 
 def moving_part(rows):
     words = (
-        "A bridge that joins a bench which has moved for 2.53 s (noise of 20 µm, steps of 15 µm), "
-        "noise-aware observer at 20 Hz: force error from 0.2 s after the first estimate on, N RMS. "
-        "Live runs are in real time:"
+        "A bridge that joins a bench which has been moving for 2.53 s (noise of 20 µm, resolution "
+        "of 15 µm), noise-aware observer of 20 Hz: force error in N (RMS), from 0.2 s after the "
+        "first estimate on. Live runs are in real time:"
     )
     cells = [
         (seed, *(f"{value:.2f}" for value in row.values())) for seed, row in enumerate(rows, 1)
@@ -325,16 +331,18 @@ def grid_part(rows):
     low, high = np.percentile(held, [5, 95])
     words = (
         f"{len(rows)} benches of the grid: {_span(MASSES_KG, 1)} kg, {_span(NATURAL_HZ, 1)} Hz, "
-        f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights a second. Errors are "
-        "held against those of the published gains, scaled with the mass:"
+        f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights per second. The errors "
+        "are divided by those of the published gains, scaled with the mass. A ratio near zero "
+        "means that the error with the published gains is far larger than the force itself, as in "
+        "an unstable loop:"
     )
     return [
         words,
         table(("observer", "unstable", "median ratio of errors", "largest ratio"), cells),
         "With the published gains the error is larger than the peak of the force on "
         f"{sum(row['paper'] > 1.0 for row in rows)} of these benches.",
-        f"The 95 % intervals of the noise-aware observer hold {held.mean():.1f} % of the forces in "
-        f"the mean, {low:.1f} to {high:.1f} % on nine benches of ten.",
+        f"The 95 % intervals of the noise-aware observer contain {held.mean():.1f} % of the true "
+        f"forces on average, and {low:.1f} to {high:.1f} % on nine of ten benches.",
     ]
 
 

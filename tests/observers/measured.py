@@ -31,16 +31,19 @@ LOST = 2.0
 """An estimate that errs by twice the force's deviation is none."""
 
 TEXT = """
-The observers follow measured records, and their force is held against another measure of it. EMPS
-is a positioning stage without a spring; its model has mass and viscous damping and lacks its dry
-friction. The force of its friction was not measured: the estimate is held against the force
-smoothed afterwards. The MR damper was measured on a dyno with a load cell. Its record is made a
-free body's: the applied force is what a body of 100 kg at the smoothed motion would need, and the
-estimate, from that force and the raw displacement, is held against the load cell. Errors are RMS,
-over the standard deviation of the force, in the longest stretch that a first observer follows
-without a break but for its first 0.5 s, at the ticks where the estimate is valid; their share is in
-parentheses where it is less than all. `lost` is an error of more than twice that deviation. Gains
-are tuned on the same record.
+The observers follow measured records, and the estimated force is compared with a reference force.
+
+- EMPS is a positioning stage without a spring. Its model has mass and viscous damping, but not the
+  dry friction. The friction force was not measured: the reference is the force smoothed after the
+  run.
+- The MR damper was measured on a dyno with a load cell. From its record, a free body of 100 kg is
+  constructed: the applied force is the force that this body requires for the smoothed motion. The
+  observer uses this force and the raw displacement; the reference is the load cell.
+
+An error is the RMS error relative to the standard deviation of the force. It is evaluated at the
+valid ticks of the longest section that a first observer follows without an interruption, except its
+first 0.5 s. The share of valid ticks is in parentheses if it is below 100 %. `lost` is an error of
+more than twice the standard deviation. The gains are tuned on the same record.
 """
 
 MODEL = """
@@ -151,8 +154,8 @@ def main():
     paths = sorted((given.data / "mr_damper").glob("*.txt"))[:6]
     rows += [mr_damper(path) for path in paths]
     if given.page:
-        heads = ("record", "held against", "noise, µm", "deviation of the force, N")
-        kinds = ("published gains", "tuned PI", "noise-aware", "smoothed afterwards")
+        heads = ("record", "reference", "noise, µm", "standard deviation of the force, N")
+        kinds = ("published gains", "tuned PI", "noise-aware", "smoothed after the run")
         title = "The observers on measured data"
         found = table((*heads, *kinds), rows)
         write_evidence("observers-measured", title, TEXT, [found], command_line())

@@ -13,11 +13,12 @@ from tests.scoreboard.run import run_scoreboard
 from tests.scoreboard.table import page
 
 TEXT = """
-Sets that others measured and published are diagnosed with `rig diagnose`, from a rough start or
-from the published parameters. Laws and parameters are found on the part that is learnt from; the
-tests take no part in search and fit, and can only withdraw laws. Each table has one set: a line a
-model, a column a test. Models named `rig` are computed here, the others are published figures from
-the source in the last column.
+Published data of measured benches are diagnosed with `rig diagnose`, from a rough start model or
+from the published parameters. Laws and parameters are determined from the training data; the test
+data take no part in the search and the fit, and can only cause laws to be removed.
+
+Each table contains one data set, with one row per model and one column per test. The models called
+`rig` were computed here; the others are published figures from the source in the last column.
 """
 
 

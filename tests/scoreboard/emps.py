@@ -40,13 +40,13 @@ def emps_rows(data_folder: Path | None, out: Path, progress: Progress) -> list[R
         try:
             result = diagnose_runs([files[learnt]], model, [files[test]], folder, share)
         except RecordingError as error:
-            why = f"here, from {learnt}: refused: {error}"
+            why = f"computed here; training data {learnt}; refused: {error}"
             rows.append(Row(_NAME, test, CORRECTED, None, _UNIT, why))
             continue
         write_report(result, folder / "report.html")
         error = result.diagnosis.held_out.height_rmse_m
-        start = "here, mass and damping as published, no friction"
+        start = "computed here; start model with published mass and damping, no friction"
         rows.append(Row(_NAME, test, START, _MM_PER_M * error.before, _UNIT, start))
-        how = f"here, from {learnt}: {findings(result.diagnosis)}"
+        how = f"computed here; training data {learnt}; {findings(result.diagnosis)}"
         rows.append(Row(_NAME, test, CORRECTED, _MM_PER_M * error.after, _UNIT, how))
     return rows

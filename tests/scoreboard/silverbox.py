@@ -112,14 +112,16 @@ def silverbox_rows(data_folder: Path | None, out: Path, progress: Progress) -> l
     model = driven_start(record, "silverbox", _RESONANCE_HZ)
     began_s = time.monotonic()
     share = within(progress, 0.05, 0.95, SILVERBOX)
-    specs = [(START, model, f"here: resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")]
+    specs = [
+        (START, model, f"computed here; resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")
+    ]
     try:
         result = diagnose_runs([training], model, tests, out / "diagnosis", share)
     except RecordingError as error:
         refused = f"refused: {error}"
         rows += [Row(SILVERBOX, part.name, CORRECTED, None, _MV, refused) for part in TESTS]
     else:
-        how = f"here, in {time.monotonic() - began_s:.0f} s: {findings(result.diagnosis)}"
+        how = f"computed here in {time.monotonic() - began_s:.0f} s; {findings(result.diagnosis)}"
         write_report(result, out / "diagnosis" / "report.html")
         specs.append((CORRECTED, load_model(out / "diagnosis" / CORRECTED_FILE), how))
     progress(f"{SILVERBOX}: tests", 0.98)

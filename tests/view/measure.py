@@ -1,8 +1,8 @@
-"""What the page costs, and how it grows: `python -m tests.view.measure --out FOLDER`.
+"""What the live page costs, and how it grows: `python -m tests.view.measure --out FOLDER`.
 
 Prints how long an hour-long run takes to open, missed ticks and lateness of a live run with and
 without a page open (interleaved), and the memory of server and page while a long run is followed.
-Wants Chromium and Playwright.
+Requires Chromium and Playwright.
 """
 
 import argparse
@@ -24,13 +24,18 @@ from tests.view.serving import make_run
 
 RATE_HZ = 1000
 TEXT = """
-`rig view` serves a page that Chromium, without a window, opens. The hour-long run has made-up steps
-at 1 kHz and files as a live run leaves them; the time is from the request of the page until the
-whole run is drawn. A live run at 1 kHz, for {seconds} s each, alternates without a page and with
-one open, and its missed ticks and lateness are compared within a pair. Nothing else is made busy.
-Memory of the server is what it does not share with files, that of the page is the JavaScript heap
-after a collection of garbage. A browser with a graphics processor takes less from the cores than
-this one.
+Headless Chromium opens the page that `rig view` serves, and draws it in software; a browser that
+draws with a graphics processor uses less CPU time. No artificial load runs on the cores.
+
+For the time to open the page, a run of one hour is generated: synthetic steps at 1 kHz, in files
+such as a live run leaves. The time runs from the request of the page until the whole run is drawn.
+
+For the effect on a run, live runs of {seconds} s at 1 kHz (bridge and simulated bench in one
+process, on a virtual bus) alternate between no page and one open page. Missed ticks and lateness
+are compared within each pair.
+
+The memory of the server is its anonymous resident memory (RssAnon), that of the page the JavaScript
+heap after a garbage collection.
 """
 ADDRESS = re.compile(r"http://\S+")
 
@@ -138,22 +143,43 @@ def grow(folder, minutes):
     return rows
 
 
+def listed(items):
+    """Items as a list in a sentence."""
+    *first, last = items
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def conclusion(pairs, seconds):
+    """What the pairs show of the missed ticks."""
+    differences = [with_page[0] - without[0] for without, with_page in pairs]
+    numbers = listed(f"{it:+d}" for it in differences)
+    found = f"Missed ticks with a page less those without: {numbers}."
+    if min(differences) > 0:
+        return f"{found} In every pair, more ticks are missed with a page."
+    return (
+        f"{found} The sign changes from pair to pair: {len(pairs)} pairs of {seconds} s do not "
+        "show a cost of the page."
+    )
+
+
 def write_page(opened_s, pairs, memory, seconds):
     """Write the guide's page."""
-    times = ", ".join(f"{time_s:.2f} s" for time_s in opened_s)
-    parts = [f"The hour-long run opened in {times}."]
+    times = listed(f"{time_s:.2f} s" for time_s in opened_s)
+    parts = [f"The run of one hour opened in {times}, in {len(opened_s)} tries."]
     if pairs:
-        heads = ("pair", "missed ticks without", "with a page")
-        lateness = ("lateness p99.9 without, µs", "with a page, µs")
+        ticks = RATE_HZ * seconds
+        heads = ("pair", f"missed ticks (of {ticks}) without a page", "missed ticks with a page")
+        lateness = ("lateness p99.9 without a page, µs", "lateness p99.9 with a page, µs")
         rows = [
             (number, without[0], with_page[0], f"{without[1]:.0f}", f"{with_page[1]:.0f}")
             for number, (without, with_page) in enumerate(pairs, start=1)
         ]
-        parts.append(table((*heads, *lateness), rows))
+        parts += [table((*heads, *lateness), rows), conclusion(pairs, seconds)]
     if memory:
-        parts.append(table(("minute of a live run", "server, MiB", "page, MiB"), memory))
+        heads = ("minutes after the start of a live run", "server, MiB", "page, MiB")
+        parts.append(table(heads, memory))
     text = TEXT.format(seconds=seconds)
-    write_evidence("page", "What the page costs", text, parts, command_line())
+    write_evidence("page", "What the live page of `rig view` costs", text, parts, command_line())
 
 
 def main():
