@@ -37,7 +37,7 @@ def bench(
     ] = None,
     duration_s: Annotated[
         float | None,
-        typer.Option(metavar="S", min=0.001, help="Length; until Ctrl-C by default."),
+        typer.Option(metavar="S", min=0.001, help="Duration; until Ctrl-C by default."),
     ] = None,
     bridge: Annotated[
         Path | None,

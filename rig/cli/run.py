@@ -23,7 +23,7 @@ def run(
     configs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="CONFIG", help="YAML file; several run as separate bridges at once."
+            metavar="CONFIG", help="Configuration, a YAML file; several run as separate bridges."
         ),
     ],
     out: Annotated[
@@ -43,7 +43,7 @@ def run(
         typer.Option(
             metavar="S",
             min=0.001,
-            help="Length of the run; else the configuration's, or until Ctrl-C.",
+            help="Duration; by default that of the configuration, or until Ctrl-C.",
         ),
     ] = None,
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
@@ -51,14 +51,14 @@ def run(
         bool, typer.Option("--force", help="Run although `rig check` finds an error.")
     ] = False,
     trace: Annotated[
-        bool, typer.Option("--trace", help="Keep what became of late ticks, for `rig timing`.")
+        bool, typer.Option("--trace", help="Record the parts of late ticks for `rig timing`.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it in order.
 
-    Several configurations are as many bridges, a process each, each with a folder in `--out` that
-    is called as its configuration; the exit code is the worst of theirs.
+    Each of several configurations runs as a separate process, with a folder in `--out` that has the
+    name of the configuration. The exit code is the highest of theirs.
     """
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     if len(configs) > 1:

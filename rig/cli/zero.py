@@ -22,11 +22,11 @@ EXAMPLES = (
 )
 
 StrutName = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Which strut, where the model has several.")
+    str | None, typer.Option(metavar="NAME", help="Strut, if the model has several.")
 ]
 LengthNow = Annotated[
     float | None,
-    typer.Option("--length-m", metavar="M", min=1e-4, max=100.0, help="Its length now."),
+    typer.Option("--length-m", metavar="M", min=1e-4, max=100.0, help="Present length of the strut."),
 ]
 TareOf = Annotated[
     str | None,
@@ -38,10 +38,10 @@ TareOf = Annotated[
     ),
 ]
 ListenSeconds = Annotated[
-    float, typer.Option(metavar="S", min=0.1, max=600.0, help="How long to listen.")
+    float, typer.Option(metavar="S", min=0.1, max=600.0, help="Time to listen.")
 ]
 FromRun = Annotated[
-    Path | None, typer.Option(metavar="RUN", help="A run at rest, instead of the bus now.")
+    Path | None, typer.Option(metavar="RUN", help="Use a run recorded at rest instead of the bus.")
 ]
 
 
@@ -61,7 +61,7 @@ def zero_command(
     """Measure a sensor's zero, direction or tare at rest, and write it into the configuration.
 
     A first length gives the zero. A second one, 5 mm or more away, shows whether the sensor is
-    reversed, and that its scale is right. Nothing is sent.
+    reversed, and whether its scale is right. Nothing is sent.
     """
     from rig.plan.load import load_plan
     from rig.sensors.mounting import as_read, entry_of, find_tare, find_zero, write_mounting

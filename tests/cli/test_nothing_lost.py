@@ -149,7 +149,7 @@ def test_a_wrong_configuration_is_one_line(tmp_path, monkeypatch, capsys, text, 
     ("arguments", "words"),
     [
         (("run",), "CONFIG"),
-        (("run", "x.yaml", "--duration-s", "inf"), "cannot be read"),
+        (("run", "x.yaml", "--duration-s", "inf"), "no such file"),
         (("run", CONFIGS / "reference.yaml", "--duration-s", "inf"), "expected a finite number"),
         (("nosuch",), "nosuch"),
         (("demo", "--seed", "minus"), "--seed"),
