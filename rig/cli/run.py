@@ -58,7 +58,7 @@ def run(
     """Run the bridge on a bus; Ctrl-C ends it in order.
 
     Each of several configurations runs as a separate process, with a folder in `--out` that has the
-    name of the configuration. The exit code is the highest of theirs.
+    name of the configuration. The exit code is the worst of theirs: 2, then 1.
     """
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     if len(configs) > 1:

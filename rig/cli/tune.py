@@ -43,7 +43,10 @@ ResidualRms = Annotated[
     typer.Option(metavar="N", min=0.0, help="Without a run: RMS of the residual force."),
 ]
 HighestFrequency = Annotated[
-    float | None, typer.Option(metavar="HZ", min=0.0, help="Without a run: highest frequency of the residual force.")
+    float | None,
+    typer.Option(
+        metavar="HZ", min=0.0, help="Without a run: highest frequency of the residual force."
+    ),
 ]
 NoiseStd = Annotated[
     float | None,
@@ -93,7 +96,10 @@ def tune_command(
         str, typer.Option(metavar="KIND", help="kalman (noise-aware), or pi.")
     ] = "kalman",
     damping_ratio: Annotated[
-        float, typer.Option(metavar="RATIO", min=0.0, max=1.0, help="Smallest damping ratio of all poles.")
+        float,
+        typer.Option(
+            metavar="RATIO", min=0.0, max=1.0, help="Smallest damping ratio of all poles."
+        ),
     ] = 0.1,
     gain_margin: GainMargin = None,
     settling_s: SettlingTime = None,

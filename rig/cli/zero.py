@@ -26,7 +26,9 @@ StrutName = Annotated[
 ]
 LengthNow = Annotated[
     float | None,
-    typer.Option("--length-m", metavar="M", min=1e-4, max=100.0, help="Present length of the strut."),
+    typer.Option(
+        "--length-m", metavar="M", min=1e-4, max=100.0, help="Present length of the strut."
+    ),
 ]
 TareOf = Annotated[
     str | None,

@@ -110,9 +110,9 @@ def test_what_is_no_configuration_is_said_in_one_line(tmp_path, text):
 
 
 def test_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match="no such file|cannot be read"):
+    with pytest.raises(InputError, match=r"no such file|cannot be read"):
         load_bench_config(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="no such file|cannot be read"):
+    with pytest.raises(InputError, match=r"no such file|cannot be read"):
         load_bench_config(tmp_path)
     (tmp_path / "huge.yaml").write_bytes(b"#" * 5_000_000)
     with pytest.raises(InputError, match="larger than"):
