@@ -1,8 +1,8 @@
 """The guide as a web site: Markdown pages, what the code knows put into them, built by MkDocs.
 
-A page holds `<!-- generated: NAME -->` where a list or table stands that code knows; it is written
-there when the site is built, so that no page can contradict the program. Everything the site needs
-is in its folder: pages and search work from a file, without a network.
+A page holds a quotation that ends with `<!-- generated: NAME -->` where a list or table stands that
+code knows. It is written there when the site is built, so that no page can contradict the program.
+Everything the site needs is in its folder: pages and search work from a file, without a network.
 """
 
 import importlib
@@ -21,7 +21,7 @@ from rig.machine.installed_versions import version_of
 PAGES = Path(__file__).with_name("pages")
 """Folder of the pages."""
 
-GENERATED = re.compile(r"^<!-- generated: ([\w-]+) -->$", re.MULTILINE)
+GENERATED = re.compile(r"^> .*<!-- generated: ([\w-]+) -->$", re.MULTILINE)
 """Where a page has what code knows."""
 
 Block = Callable[[Path], str]
