@@ -72,6 +72,8 @@ def bench(
             raise InputError("--lockstep: expected --bridge CONFIG and --out DIR with it")
         _run_with_bridge(config, bridge, model, out, duration_s, as_json=as_json)
         return
+    if model is not None:
+        raise InputError("--model: expected --lockstep with it")
     from rig.bus.bus import BusConfig
     from rig.plan.load import load_plan
     from rig.run.live import run_bench
@@ -120,13 +122,13 @@ def _run_with_bridge(
 
     plan = load_plan(bridge, model=model, duration_s=duration_s)
     bench_config = load_bench_config(config)
+    # No frame of a simulated bench may reach the configured bus.
+    bus = replace(plan.config.bus, interface="virtual", channel="lockstep", options={})
+    plan = plan.with_config(plan.config.model_copy(update={"bus": bus}))
     wrong = errors(plan)
     if wrong:
         raise InputError(f"{bridge}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all)")
     refuse_full(out)
-    # No frame of a simulated bench may reach the configured bus.
-    bus = replace(plan.config.bus, interface="virtual", channel="lockstep", options={})
-    plan = plan.with_config(plan.config.model_copy(update={"bus": bus}))
     with stoppable() as stop, status_line(plan.config.duration_s) as watch:
         ended = with_bench(
             plan, bench_config, out, RunControl(stop=stop, watch=watch), lockstep=True

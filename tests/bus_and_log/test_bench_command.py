@@ -2,10 +2,13 @@
 
 import json
 
+import pytest
 import yaml
 from typer.testing import CliRunner
 
+from can_dbc.errors import InputError
 from rig.cli.main import app
+from rig.log.reader import read_header
 from rig.plan.config import CONFIGS
 
 
@@ -27,3 +30,37 @@ def test_it_takes_bus_and_key_from_the_bridge_and_writes_a_summary(tmp_path):
     assert summary == {"bench": "reference_bench", "frames": summary["frames"]}
     assert f"Sent {summary['frames']} frames" in done.output
     assert summary["frames"] > 0
+
+
+def bench(*arguments):
+    return CliRunner().invoke(app, ["bench", str(CONFIGS / "reference_bench.yaml"), *arguments])
+
+
+def test_it_runs_a_bridge_with_it_without_its_bus(tmp_path):
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    # An interface that cannot be opened here: nothing is to open it.
+    config["bus"] = {"interface": "pcan", "channel": "PCAN_USBBUS1"}
+    bridge = tmp_path / "bridge.yaml"
+    bridge.write_text(yaml.safe_dump(config))
+    out = tmp_path / "run"
+    arguments = ["--bridge", str(bridge), "--lockstep", "--duration-s", "0.5", "--out", str(out)]
+    done = bench(*arguments, "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.output)["mode"] == "RUNNING"
+    assert read_header(out)["config"]["bus"]["interface"] == "virtual"
+    again = bench(*arguments)
+    assert isinstance(again.exception, InputError)
+    assert "expected" in str(again.exception)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--lockstep"], "--lockstep: expected --bridge CONFIG and --out DIR"),
+        (["--model", "reference"], "--model: expected --lockstep"),
+    ],
+)
+def test_options_that_need_others_are_refused_without_them(arguments, expected):
+    done = bench(*arguments)
+    assert isinstance(done.exception, InputError)
+    assert expected in str(done.exception)
