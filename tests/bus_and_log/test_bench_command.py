@@ -43,7 +43,7 @@ def test_it_runs_a_bridge_with_it_without_its_bus(tmp_path):
     bridge = tmp_path / "bridge.yaml"
     bridge.write_text(yaml.safe_dump(config))
     out = tmp_path / "run"
-    arguments = ["--bridge", str(bridge), "--lockstep", "--duration-s", "0.5", "--out", str(out)]
+    arguments = ["--bridge", str(bridge), "--lockstep", "--duration-s", "3", "--out", str(out)]
     done = bench(*arguments, "--json")
     assert done.exit_code == 0
     assert json.loads(done.output)["mode"] == "RUNNING"
