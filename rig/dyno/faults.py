@@ -126,7 +126,8 @@ class MasterComparison(NamedTuple):
     def words(self) -> str:
         """The same in a sentence."""
         if self.is_good:
-            text = "as its master, within what manufacturing scatters"
+            where = " in the steps that were compared" if self.not_compared else ""
+            text = f"as its master{where}, within what manufacturing scatters"
         elif not self.named:
             text = "not as its master, and no fault that is known explains it"
         else:
