@@ -34,13 +34,13 @@ A fleet of {RUNS} simulated dyno runs ({DAMPERS} dampers on {BENCHES} benches, {
 {RATE_HZ:g} Hz per run) is diagnosed twice on one machine with {CORES} cores: with a Dask cluster of
 {WORKERS} workers, one of which is killed after a third of the runs, and with {CORES} processes. The
 throughput is compared with that of plain loops, which diagnose one run after the other: {CORES}
-such loops run simultaneously, one per core, and share {singles} of the runs.
+such loops run simultaneously, one per core; together they diagnose {singles} runs, each run once.
 
 The cost of distribution is the CPU time of the campaign's own process and of Dask's scheduler. The
-runs are short: with longer ones, distribution costs a smaller share. What a campaign costs once is
-spread over its runs, so that with few runs each has a larger cost. The machine had other work, so
-that the times scatter. Loops and campaigns ran one after the other: a ratio above 1 does not show a
-gain by distribution.
+runs are short: with longer ones, distribution costs a smaller share. The fixed cost of a campaign
+is divided by the number of its runs: with few runs, the cost per run is larger. The loops and the
+two campaigns ran at different times, under a different load of the machine. A ratio above 1 comes
+from this load, not from distribution.
 """
 
 
@@ -156,7 +156,7 @@ def write_page(campaigns: Sequence[Measured], alone: float, singles: int, senten
     text = TEXT.format(**numbers, RATE_HZ=RATE_HZ, seconds=SAMPLES / RATE_HZ)
     loops = f"Plain loops: {alone:.2f} diagnoses per second and core."
     found = table((*heads, *costs), rows)
-    title = "What it costs to distribute a fleet"
+    title = "What it costs to distribute the diagnosis of a fleet"
     write_evidence("fleet", title, text, [loops, found, sentences], command_line())
 
 
@@ -197,10 +197,16 @@ def main() -> None:
         ((runs, keys),) = store.query(out, "SELECT count(*), count(DISTINCT key) FROM runs")[1]
         print(f"both stores hold the same: {is_same}; {runs} runs, {keys} different")
         if given.page:
+            counts = f"Each of the {runs} recordings is in them exactly once."
+            if not is_same or not runs == keys == len(sources):
+                counts = (
+                    f"The store of the processes contains {runs} runs with {keys} different keys, "
+                    f"for {len(sources)} recordings."
+                )
             sentences = (
                 f"One worker {'was' if is_gone else 'was not'} killed during the Dask campaign. "
-                f"The two stores hold {'the same' if is_same else 'different'} runs and values: "
-                f"{runs} runs, {keys} of them different, of {len(sources)} recordings."
+                f"The two stores contain {'the same' if is_same else 'different'} runs and values. "
+                f"{counts}"
             )
             write_page(campaigns, alone, min(len(sources), CORES * SINGLE), sentences)
 
