@@ -5,7 +5,7 @@ Functions for scripts and notebooks:
     import rig
 
     run = rig.open_run("runs/7")                       # arrays by column, with units in the names
-    outcome = rig.diagnose(["runs/7"], "bench.yaml", held_out=["test.csv"])
+    outcome = rig.diagnose(["runs/7"], "bench_model.yaml", held_out=["test.csv"])
     outcome.write("diagnosis")
 
 Each function imports what it needs when it is called: DART and numba take seconds.
