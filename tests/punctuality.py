@@ -27,9 +27,8 @@ The simulated bench runs in the bridge's process, and on each core a further pro
 period.
 
 Only the two runs of one pair are comparable, because the load of the machine changes more over
-hours than the two loops differ. The lines below the totals give the missed ticks by the part of the
-loop in which the time was lost, and by its cause, as `rig timing` determines it from the kernel's
-accounting.
+hours than the two loops differ. The lines below the sum divide it by the part of the loop in which
+the time was lost, and by the cause, as `rig timing` determines it from the kernel's accounting.
 """
 
 NAMES = {"bare": "empty loop", "bridge": "bridge"}

@@ -51,8 +51,8 @@ frame out per tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {gr
 The lateness is the time from a tick's deadline to the wake-up of the loop; the work is the time
 from there to the end of the tick. A missed tick is counted and not made up for. The force error is
 the RMS difference to the simulated bench's load cell, relative to the peak force. The lateness
-depends on the machine as much as on the program, so that it differs on another machine. No CAN
-hardware took part.
+depends on the machine as much as on the program: it differs on another machine. No CAN hardware
+took part.
 """
 
 _ROUND_NS = 20_000_000

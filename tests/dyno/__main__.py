@@ -16,6 +16,11 @@ values are known. The table gives the share of the intervals that contain the tr
 laws and for each law. In parentheses it gives the median half width of the interval, relative to
 the value, unless the value is zero. Correlated noise and the errors of a real sensor are not part
 of this study.
+
+*Window* is the mean force in a window about mid-stroke, *peak* the largest force, *energy* that of
+a cycle. *Mean force* and *half difference* are half the sum and half the difference of the forces
+in compression and in rebound at mid-stroke; *hysteresis at zero* is their difference at the turning
+points.
 """
 
 

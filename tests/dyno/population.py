@@ -192,14 +192,16 @@ def one(job):
 
 
 TEXT = """
-`rig characterise --master` compares a damper with a good one of the same test, and names its fault.
+`rig characterise --master` compares a damper with a good one in the same test, and names its fault.
 Here the dampers are simulated with their own equations: a polytropic gas column, a damping law with
-a sharp knee, oil whose stiffness rises with pressure, and a contact as play.
+a sharp knee, oil whose stiffness rises with pressure, and free play as a contact.
 
 Gas force, friction, damping below and above the knee, and the speed of the knee scatter by
 {scatter:g} % (standard deviation) from damper to damper, in each direction; the master has no
 scatter. Half of the dampers are good. Each of the others has one fault of a random size. Other
-faults than those in the table were not tested.
+faults than those in the table were not tested. The last column counts the dampers that were named
+correctly; it is empty where the fault has no size that is defined in the same way in the
+simulation.
 """
 
 PLANTED = {

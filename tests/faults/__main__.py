@@ -17,10 +17,10 @@ FOLDER = Path(__file__).parent
 FAULTS_TEXT = """
 The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
 fault. Faults of frames, bench and devices are injected in simulated time, 2 s after the start;
-faults of disk and process in real runs. `Within` is the time from the fault to the first tick that
-shows it, or to the state that is named. The force error is the RMS difference to the simulated
-bench over the valid ticks; it is compared with that of the same run without the fault. Combinations
-of faults are not in this table.
+faults of disk and process in real runs. *Within* is the time from the fault to the first tick that
+shows it, or to the state that is named; *loss* is what is lost of the data. The force error is the
+RMS difference to the simulated bench over the valid ticks; it is compared with that of the same run
+without the fault. Combinations of faults are not in this table.
 """
 
 PROMISE_TEXT = """
@@ -30,11 +30,12 @@ after the start. The test fails if a force with `VALID` = 1 has an error of more
 the largest error of the settled run.
 
 - *First invalid frame* and *valid again* are times since the event; these and the modes are those
-  of the noise-aware observer.
+  of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent every 100 ms: a
+  mode that begins and ends between two of these frames is not listed.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
   published gains / a damped PI observer / the noise-aware observer.
-- The events with signals (the last rows) are real processes at 100 Hz with a bus in a separate
-  network; only `VALID` is decoded.
+- In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the
+  operating system, with a bus in a separate network; only `VALID` is decoded.
 - The last column states what the bench itself has to do.
 """
 

@@ -15,7 +15,7 @@ from tests.scoreboard.table import page
 TEXT = """
 Published data of measured benches are diagnosed with `rig diagnose`, from a rough start model or
 from the published parameters. Laws and parameters are determined from the training data; the test
-data take no part in the search and the fit, and can only cause laws to be removed.
+data take no part in the search and the fit; they can only cause a law to be removed afterwards.
 
 Each table contains one data set, with one row per model and one column per test. The models called
 `rig` were computed here; the others are published figures from the source in the last column.
