@@ -110,9 +110,10 @@ class Supervision(BaseModel):
     Attributes:
         stale_after_s: Age of a height or applied force from which the estimate is invalid (HOLD).
         safe_after_s: Age of a height or applied force from which the bridge enters the safe state.
-        settling_s: Time after a start, a change of gains or a saturated virtual force until an
-            estimate is valid. By default the time in which a step of the residual force decays to a
-            hundredth in the closed loop; for `kalman` the filter's variance decides.
+        settling_s: Time after a start, a gap, a change of gains or a saturated virtual force until
+            an estimate is valid. By default the time after which the error that a step of the
+            residual force causes in the closed loop has decayed to a hundredth of the step; for
+            `kalman` the filter's variance decides.
         overload_share: Share of missed ticks, of the last few hundred, from which the estimate is
             invalid (HOLD).
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator

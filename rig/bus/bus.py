@@ -78,7 +78,7 @@ class BusConfig:
         channel: Channel of the interface.
         bitrate: Bit rate in bit/s.
         data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
-        options: Further arguments that are passed to python-can's interface unchanged.
+        options: Further arguments of python-can's interface.
     """
 
     interface: _Name = "virtual"

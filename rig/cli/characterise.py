@@ -75,7 +75,7 @@ def characterise_command(
 
     The cycles of a record must repeat; the report overlays several records. With --tolerance, the
     exit code is 1 unless every point of the band passes; with --master, unless the damper
-    is as good as the master.
+    agrees with the master in all steps of the master's record.
     """
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance

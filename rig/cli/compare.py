@@ -27,7 +27,8 @@ def compare_command(
     dose: Annotated[
         list[float] | None,
         typer.Option(
-            metavar="NUMBER", help="Pressure, clicks or °C of a state; once for each state."
+            metavar="NUMBER",
+            help="Pressure, clicks or °C of a state; once for each state, in order.",
         ),
     ] = None,
     strut: StrutOfRun = None,
@@ -35,7 +36,7 @@ def compare_command(
 ) -> None:
     """Compare two states of a damper: list the figures that differ significantly, and the others.
 
-    With --dose, once for each state: fit the change of each figure over the dose.
+    With --dose, once for each state: fit a straight line to each figure over these values.
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, trends_over_dose

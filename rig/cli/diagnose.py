@@ -10,7 +10,7 @@ from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
 from rig.cli.terminal import JsonFlag, print_text, refuse_existing
 
-EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
+EXAMPLES = "Example: `rig diagnose runs/7 --model model.yaml --held-out runs/8 --out found`"
 
 
 def diagnose(

@@ -114,7 +114,7 @@ def run_command(
     """Diagnose many runs, each by itself, and keep the results in a store of Parquet files.
 
     What is in the store is not computed again: the same command continues a fleet that was
-    interrupted. A run that fails is a row with its error. Exit code 1 if any failed now.
+    interrupted. A run that fails gets a row with its error; the exit code is then 1.
     """
     from dart_model.spec import model_file
     from rig.fleet.campaign import load_fleet_model, run_campaign

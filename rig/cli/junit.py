@@ -14,7 +14,7 @@ JUNIT = "--junit "
 
 JUnitFile = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Write it as JUnit XML too, for a CI server."),
+    typer.Option(metavar="FILE", help="Also write the result as JUnit XML, for a CI server."),
 ]
 
 

@@ -55,7 +55,7 @@ def run(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run the bridge on a bus; Ctrl-C ends it in order.
+    """Run the bridge on a bus; Ctrl-C ends it properly.
 
     Each of several configurations runs as a separate process, with a folder in `--out` that has the
     name of the configuration. The exit code is the worst of theirs: 2, then 1.

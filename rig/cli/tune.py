@@ -54,7 +54,8 @@ NoiseStd = Annotated[
         metavar="M",
         min=1e-12,
         max=1.0,
-        help="Without a run: standard deviation of the height; absent: by the DBC's steps.",
+        help="Without a run: standard deviation of the height's noise; by default that of the "
+        "signal's resolution in the DBC.",
     ),
 ]
 GainMargin = Annotated[

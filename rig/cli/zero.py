@@ -35,8 +35,8 @@ TareOf = Annotated[
     typer.Option(
         "--tare",
         metavar="CHANNEL",
-        help="applied_force, load_cell_force, or STRUT.SENSOR of a further force, while nothing "
-        "pulls or pushes it.",
+        help="Force sensor whose tare is measured while no force acts on it: applied_force, "
+        "load_cell_force, or STRUT.SENSOR of a further sensor.",
     ),
 ]
 ListenSeconds = Annotated[

@@ -178,7 +178,9 @@ def _effect(item: Effect, pictures: Path) -> str:
         for it in item.parameters[:_MOST_PARAMETERS]
     ]
     more = len(item.parameters) - _MOST_PARAMETERS
-    simpler = f" It contains {', '.join(item.simpler)} as a special case." if item.simpler else ""
+    names = ", ".join(f"`{name}`" for name in item.simpler)
+    simpler = f" A diagnosis names a simpler law instead if it fits as well: {names}."
+    simpler *= bool(item.simpler)
     parts = [
         f"### {item.name}",
         f"{item.words[0].upper()}{item.words[1:]}.{simpler} Required excitation: "

@@ -237,7 +237,7 @@ class Unsafe(_Frozen):
 
     Attributes:
         publish_without_valid: Publish a strut's force without the signal `valid`. A receiver cannot
-            distinguish the force of a lost estimate from a right one.
+            distinguish an invalid estimate from a valid one.
     """
 
     publish_without_valid: bool = False
@@ -284,9 +284,9 @@ class RunConfig(_Frozen):
     Attributes:
         rate_hz: Ticks per second.
         duration_s: Length of the run; if absent, it lasts until Ctrl-C.
-        model: Model file, from the folder of the configuration on, or the name of a shipped model.
+        model: Model file, relative to the configuration's folder, or the name of a shipped model.
         engine: Program that simulates the model.
-        dbc: DBC file, from the folder of the configuration on; the package's own if absent.
+        dbc: DBC file, relative to the configuration's folder; the package's own if absent.
         bus: Interface, channel and bit rates of the bus.
         authentication: Authentication of all frames; none if absent.
         signals: Signals that are read from the bus.
