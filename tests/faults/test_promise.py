@@ -211,7 +211,7 @@ EVENTS = [
     Event("frames delayed by 20 ms in a gateway, every 2 s", STOP, gateway(20, 2000)),
     Event("the loop stands still for 100 ms", STOP, missed=range(BEGIN_MS, BEGIN_MS + 100)),
     Event(
-        "the loop stands still for 2 s (suspend), then acknowledged",
+        "the loop stands still for 2 s, then acknowledged",
         "do not use the force while VALID is 0; without a watchdog, detect that the frames stop",
         conditions=acknowledged,
         missed=range(BEGIN_MS, BEGIN_MS + 2000),
