@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from dart_model.spec import ModelSpec
-from rig.diagnosis.evaluate import evaluate_held_out
+from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given
 from rig.diagnosis.numerics.compiled import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import Result
@@ -15,10 +13,8 @@ from rig.diagnosis.problem.problem import (
     CandidateModel,
     Problem,
     RunEvaluation,
-    first_starts,
     free_linear,
     nominal,
-    nominal_model,
     quadratic_mean,
 )
 from rig.diagnosis.progress import Progress, within
@@ -189,15 +185,7 @@ def first_fits(problem: Problem) -> tuple[Fit, Fit]:
     Raises:
         RecordingError: The nominal model runs away on the recordings.
     """
-    base = nominal(problem)
-    first = nominal_model(problem, first_starts(problem, base))
-    none_free = np.zeros(len(problem.linear), dtype=np.bool_)
-    given = fit(problem, first, none_free, Effort(8), effects=False)
-    if given is None:
-        raise RecordingError(
-            f"model {problem.spec.name}: runs away on the recordings, expected one that stays "
-            "near them: check its stiffness, its free length and the sign of the applied force"
-        )
+    base, given = nominal(problem), fit_as_given(problem)
     free = free_linear(problem, base)
     near = fit(problem, given.model, free, Effort(12), most_level=1.0) or given
     first = CandidateModel(base, near.parts)
