@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from rig.diagnosis.problem.problem import RunEvaluation
 
 EXAMPLES = (
-    "Examples: `rig evaluate runs/9 --model bench.yaml` · before and after a correction: "
-    "`rig evaluate runs/9 --model bench.yaml --model found/corrected.yaml`"
+    "Examples: `rig evaluate runs/9 --model model.yaml` · before and after a correction: "
+    "`rig evaluate runs/9 --model model.yaml --model found/corrected.yaml`"
 )
 
 
