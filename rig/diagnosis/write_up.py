@@ -408,9 +408,8 @@ def find_friction_n(force_n: Array, velocity_m_per_s: Array) -> float | None:
     """Dry friction in N that a force is along a motion, both of shape (n,); None if it is none."""
     direction = np.sign(velocity_m_per_s)
     friction_n = -float(np.mean(force_n * direction))
-    if not friction_n > 0.0 or rms(force_n + friction_n * direction) > _FRICTION_LIKE * rms(force_n):
-        return None
-    return friction_n
+    is_friction = rms(force_n + friction_n * direction) <= _FRICTION_LIKE * rms(force_n)
+    return friction_n if is_friction and friction_n > 0.0 else None
 
 
 def _resembles_hold(problem: Problem, result: Fit) -> bool:
