@@ -63,10 +63,10 @@ def write_page(rows: list[dict[str, tuple[int, Counter[str]]]], text: str, secon
     causes = {name: sum((row[name][1] for row in rows), Counter[str]()) for name in NAMES}
     low, middle, high = np.percentile(counts, [10, 50, 90], axis=0)
     spread = [f"{m:g} ({a:g} to {b:g})" for a, m, b in zip(low, middle, high, strict=True)]
-    total = causes["bare"] + causes["bridge"]
+    total, ticks = causes["bare"] + causes["bridge"], seconds * 1000
     cells = [
-        ("median over the pairs (10 to 90 %)", *spread),
-        (f"sum over {len(rows)} pairs", *counts.sum(axis=0)),
+        (f"median over the pairs, of {ticks:g} ticks each (10 to 90 %)", *spread),
+        (f"sum over {len(rows)} pairs, of {len(rows) * ticks:g} ticks", *counts.sum(axis=0)),
         *(
             (f"- {cause}", *(causes[name][cause] for name in NAMES))
             for cause, _ in total.most_common()
@@ -78,7 +78,7 @@ def write_page(rows: list[dict[str, tuple[int, Counter[str]]]], text: str, secon
         "Is the bridge as punctual as an empty loop?",
         text,
         [
-            table((f"missed ticks of {seconds * 1000:g}", *NAMES.values()), cells),
+            table(("missed ticks", *NAMES.values()), cells),
             "Missed ticks of the bridge less those of the empty loop, median over the pairs: "
             f"{difference}.",
         ],

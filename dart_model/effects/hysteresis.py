@@ -236,7 +236,7 @@ GENERAL_BOUC_WEN = _hysteresis(
 
 FRICTION_BEHIND_PLAY = _hysteresis(
     name="friction_behind_play",
-    words="friction behind play (pinching)",
+    words="friction in series with free play (pinched hysteresis loop)",
     parameters=(
         Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction"),
         Parameter("gap_m", "m", 1e-12, 1e4, "width of the play"),

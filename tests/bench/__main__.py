@@ -37,7 +37,8 @@ the ratio of the two medians.
 - *Plant alone*: DART with the bridge's third-order integrator.
 - *Plant, observer and supervisor*: the same with a PI observer and the supervision of the mode,
   without frames.
-- *Whole tick of the bridge*: one frame is decoded and checked, one frame is sent.
+- *Whole tick of the bridge*: one frame is decoded and checked, and one is encoded; the bus
+  driver and the log are not included.
 - *Hand-written loop*: it decodes a frame with cantools, steps DART with a PI observer, and encodes
   a frame, without checks, modes or limits.
 

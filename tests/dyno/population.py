@@ -199,9 +199,9 @@ a sharp knee, oil whose stiffness rises with pressure, and free play as a contac
 Gas force, friction, damping below and above the knee, and the speed of the knee scatter by
 {scatter:g} % (standard deviation) from damper to damper, in each direction; the master has no
 scatter. Half of the dampers are good. Each of the others has one fault of a random size. Other
-faults than those in the table were not tested. The last column counts the dampers that were named
-correctly; it is empty where the fault has no size that is defined in the same way in the
-simulation.
+faults than those in the table were not tested. The last column counts, of the dampers
+that were named correctly, those whose 95 % interval contains the true size of the fault; it is
+empty where the reported size has no counterpart in the simulation.
 """
 
 PLANTED = {
