@@ -113,5 +113,6 @@ def _run_one(
         return
     following = diagnosis_of(plan, folder)
     if listen_only:
-        following = f"rig tune {config} --run {folder} --out tuned.yaml"
+        other, name = ("", "tuned") if model is None else (f" --model {model}", "corrected")
+        following = f"rig tune {config}{other} --run {folder} --out {config.with_name(name)}.yaml"
     print_end(plan, ended, folder, following, with_timing=True)
