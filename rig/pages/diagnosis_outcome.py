@@ -39,5 +39,8 @@ class DiagnosisOutcome:
     def __str__(self) -> str:
         return f"{self.diagnosis.verdict}: {sentence(self.diagnosis, len(self.nominal.struts))}"
 
+    # A notebook keeps this beside the tables: without the thousands of numbers, and without paths.
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         return render("report/outcome.html", outcome=self, diagnosis=self.diagnosis, tables=tables)

@@ -35,3 +35,17 @@ def test_the_notebook_runs_and_finds_the_effect(tmp_path):
     assert "explained: The model lacks" in table
     assert "cubic_stiffness" in table
     assert (tmp_path / "notebook" / "again" / "report.html").exists()
+
+
+def test_what_is_saved_in_the_notebook_names_no_folder_of_a_machine():
+    book = nbformat.read(NOTEBOOK, as_version=4)
+    saved = [
+        str(text)
+        for cell in book.cells
+        for output in cell.get("outputs", [])
+        for kind, text in output.get("data", {}).items()
+        if kind != "image/png"
+    ]
+    assert saved
+    assert not [text for text in saved if "PosixPath" in text or "/home/" in text]
+    assert max(map(len, saved)) < 2000
