@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end, refuse_bad_end
+from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end
 from rig.cli.progress import progress_line, status_line, stoppable
 from rig.cli.summary_file import write_summary
 from rig.cli.terminal import (
@@ -115,7 +115,7 @@ def _run_with_bridge(
     from dataclasses import replace
 
     from rig.plan.load import load_plan
-    from rig.plan.preflight_checks import errors
+    from rig.plan.preflight_checks import errors, refusal
     from rig.run.live import with_bench
     from rig.run.loop import RunControl
     from rig.simulated_bench.config import load_bench_config
@@ -127,15 +127,11 @@ def _run_with_bridge(
     plan = plan.with_config(plan.config.model_copy(update={"bus": bus}))
     wrong = errors(plan)
     if wrong:
-        raise InputError(f"{bridge}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all)")
+        raise refusal(plan, wrong[0])
     refuse_full(out)
     with stoppable() as stop, status_line(plan.config.duration_s) as watch:
         ended = with_bench(
             plan, bench_config, out, RunControl(stop=stop, watch=watch), lockstep=True
         )
-        text = keep_summary(ended, out)
-    if as_json:
-        typer.echo(text, nl=False)
-        refuse_bad_end(plan, ended)
-        return
-    print_end(plan, ended, out, diagnosis_of(plan, out), with_timing=False)
+        keep_summary(ended, out)
+    print_end(plan, ended, out, diagnosis_of(plan, out), with_timing=False, as_json=as_json)

@@ -16,21 +16,36 @@ if TYPE_CHECKING:
     from rig.run.logged_run import Ended
 
 
-def keep_summary(ended: "Ended", folder: Path) -> str:
-    """Write `summary.json` into a run's folder; returns its text."""
-    text = json.dumps(ended.summary(), indent=2) + "\n"
+def _summary_text(ended: "Ended") -> str:
+    return json.dumps(ended.summary(), indent=2) + "\n"
+
+
+def keep_summary(ended: "Ended", folder: Path) -> None:
+    """Write `summary.json` into a run's folder."""
     with contextlib.suppress(OSError):  # a full disk, which the table reports
-        (folder / "summary.json").write_text(text, "utf-8")
-    return text
+        (folder / "summary.json").write_text(_summary_text(ended), "utf-8")
 
 
 def print_end(
-    plan: "Plan", ended: "Ended", folder: Path, following: str, *, with_timing: bool
+    plan: "Plan",
+    ended: "Ended",
+    folder: Path,
+    following: str,
+    *,
+    with_timing: bool,
+    as_json: bool,
 ) -> None:
-    """Print how a run ended, refuse a bad end with its exit code, and name what follows."""
+    """Print how a run ended, refuse a bad end with its exit code, and name what follows.
+
+    As JSON, nothing but its summary is printed.
+    """
+    if as_json:
+        typer.echo(_summary_text(ended), nl=False)
+        _refuse_bad_end(plan, ended)
+        return
     print_run(ended, with_timing=with_timing)
     print_text(f"Run: {folder}")
-    refuse_bad_end(plan, ended)
+    _refuse_bad_end(plan, ended)
     if following:
         print_text(f"Next: `{following}`")
 
@@ -42,7 +57,7 @@ def diagnosis_of(plan: "Plan", folder: Path) -> str:
     return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
 
 
-def refuse_bad_end(plan: "Plan", ended: "Ended") -> None:
+def _refuse_bad_end(plan: "Plan", ended: "Ended") -> None:
     """Exit with a message where a run ended in its safe state, without a height or without a log.
 
     Raises:

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from can_dbc.errors import InputError
-from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end, refuse_bad_end
+from rig.cli.end_of_run import diagnosis_of, keep_summary, print_end
 from rig.cli.progress import status_line, stoppable
 from rig.cli.side_by_side import run_side_by_side
 from rig.cli.terminal import JsonFlag
@@ -82,7 +81,7 @@ def _run_one(
     as_json: bool,
 ) -> None:
     from rig.plan.load import load_plan
-    from rig.plan.preflight_checks import errors
+    from rig.plan.preflight_checks import errors, refusal
     from rig.run.live import live
     from rig.run.loop import RunControl
     from rig.run.trace import Trace
@@ -90,9 +89,7 @@ def _run_one(
     plan = load_plan(config, model=model, duration_s=duration_s)
     wrong = errors(plan)
     if wrong and not force:
-        raise InputError(
-            f"{config}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all; --force runs it)"
-        )
+        raise refusal(plan, wrong[0], "; --force runs it")
     refuse_full(folder)
     channels = [channel.name for channel in plan.channels]
     shown = status_line(plan.config.duration_s, channels, list(plan.config.devices))
@@ -106,13 +103,9 @@ def _run_one(
             trace=Trace(plan.period_ns) if trace else None,
         )
         # Inside: a second Ctrl-C must not lose it.
-        text = keep_summary(ended, folder)
-    if as_json:
-        typer.echo(text, nl=False)
-        refuse_bad_end(plan, ended)
-        return
+        keep_summary(ended, folder)
     following = diagnosis_of(plan, folder)
     if listen_only:
         other, name = ("", "tuned") if model is None else (f" --model {model}", "corrected")
         following = f"rig tune {config}{other} --run {folder} --out {config.with_name(name)}.yaml"
-    print_end(plan, ended, folder, following, with_timing=True)
+    print_end(plan, ended, folder, following, with_timing=True, as_json=as_json)

@@ -8,6 +8,7 @@ from enum import Enum
 from can_dbc.bus_load import frame_time_s
 from can_dbc.codec import si_range, si_step
 from can_dbc.database import Message
+from can_dbc.errors import InputError
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton, shipped_models
 from rig.bridge.free_model import grace_of_applied_force_ns
@@ -108,6 +109,13 @@ def check(plan: Plan) -> list[Finding]:
 def errors(plan: Plan) -> list[Finding]:
     """Findings that prevent a run from starting; arguments and errors as of `check`."""
     return [finding for finding in check(plan) if finding.severity is Severity.ERROR]
+
+
+def refusal(plan: Plan, finding: Finding, cure: str = "") -> InputError:
+    """The error of a run that a finding prevents from starting."""
+    return InputError(
+        f"{plan.source}: {finding.what}: {finding.text} (`rig check` shows all{cure})"
+    )
 
 
 _LONGEST_STRUT_M = 20.0

@@ -369,8 +369,8 @@ class _Sensor(_Section):
 
     @property
     def offset(self) -> float:
-        """What the sensor reads at zero, in its unit."""
-        return 0.0
+        """What the sensor reads at zero, in its unit; 0 of one without such a key."""
+        return next((value for key, value in self if key.startswith("offset_")), 0.0)
 
     @property
     def noise_std(self) -> float:
@@ -392,11 +392,6 @@ class HeightSensor(_Sensor):
     offset_m: float = 0.0
     noise_std_m: NotNegative = 0.0
 
-    @property
-    def offset(self) -> float:
-        """What it reads above the height, in m."""
-        return self.offset_m
-
 
 class AppliedForceSensor(_Sensor):
     """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise.
@@ -408,11 +403,6 @@ class AppliedForceSensor(_Sensor):
 
     offset_n: float = 0.0
     noise_std_n: NotNegative = 0.0
-
-    @property
-    def offset(self) -> float:
-        """What it reads without a force, in N."""
-        return self.offset_n
 
 
 class LoadCell(_Sensor):
@@ -427,11 +417,6 @@ class LoadCell(_Sensor):
     strut: Name
     offset_n: float = 0.0
     noise_std_n: NotNegative = 0.0
-
-    @property
-    def offset(self) -> float:
-        """What it reads without a force, in N."""
-        return self.offset_n
 
 
 class Thermometer(_Sensor):
