@@ -61,6 +61,11 @@ class Counts(NamedTuple):
     no_value: int = 0
     untimed: int = 0
 
+    @property
+    def refusals(self) -> dict[str, int]:
+        """Cause -> number of refused frames; a cause that did not occur is left out."""
+        return {name: count for name in _CAUSES_OF_REFUSAL if (count := getattr(self, name))}
+
     def plus(self, **increments: int) -> "Counts":
         """Counts with increments, by their names."""
         more = {name: getattr(self, name) + number for name, number in increments.items()}
@@ -70,6 +75,19 @@ class Counts(NamedTuple):
         """Counts with a refused frame; its cause is the name of a count, such as `wrong_crc`."""
         return self.plus(**{"refused": 1, cause: 1})
 
+
+_CAUSES_OF_REFUSAL = (
+    "wrong_crc",
+    "wrong_length",
+    "repeated",
+    "out_of_sequence",
+    "masquerade",
+    "implausible",
+    "second_sender",
+    "from_faulty_device",
+    "no_value",
+    "untimed",
+)
 
 Levels = tuple[float, float, float, float]
 """Median, 99th and 99.9th percentile, largest."""

@@ -33,6 +33,9 @@ memory."""
 _RETURN_OWN_FRAMES = ("udp_multicast",)
 """Interfaces that return what is sent on them, whatever they are asked for."""
 
+WITHOUT_BIT_RATE = ("virtual", "udp_multicast")
+"""Interfaces that are no bus with a bit rate."""
+
 SHARED_INTERFACES = ("socketcan", "udp_multicast")
 """Interfaces that several processes can use at once."""
 

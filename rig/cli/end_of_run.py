@@ -8,12 +8,17 @@ from typing import TYPE_CHECKING
 import typer
 from rich.console import Console
 
+from can_dbc.errors import InputError
 from rig.cli.result_tables import print_run
 from rig.cli.terminal import FAILED, print_text
 
 if TYPE_CHECKING:
     from rig.plan.plan import Plan
+    from rig.recordings.gaps import Gaps
     from rig.run.logged_run import Ended
+
+_LONGEST_READ_S = 120.0
+"""Longest run that is read again at its end, which takes about 4 % of its duration."""
 
 
 def _summary_text(ended: "Ended") -> str:
@@ -46,6 +51,8 @@ def print_end(
     print_run(ended, with_timing=with_timing)
     print_text(f"Run: {folder}")
     _refuse_bad_end(plan, ended)
+    if plan.has_force and (gaps := _gaps_of(ended, folder)) is not None:
+        print_text(gaps.report(folder.name), "yellow")
     if following:
         print_text(f"Next: `{following}`")
 
@@ -55,6 +62,20 @@ def diagnosis_of(plan: "Plan", folder: Path) -> str:
     if not plan.has_force:
         return ""
     return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
+
+
+def _gaps_of(ended: "Ended", folder: Path) -> "Gaps | None":
+    """Gaps of the applied force in a run in which something was missing."""
+    from rig.recordings.run_folder import read_run
+
+    counts = ended.state.counts
+    duration_s = ended.ticks * ended.period_ns * 1e-9
+    is_whole = not (counts.lost or counts.refused or counts.stale or counts.overruns)
+    if is_whole or duration_s > _LONGEST_READ_S:
+        return None
+    with contextlib.suppress(InputError):  # `rig diagnose` reports what is wrong with a recording
+        return read_run(folder).force_gaps
+    return None
 
 
 def _refuse_bad_end(plan: "Plan", ended: "Ended") -> None:

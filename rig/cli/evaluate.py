@@ -1,15 +1,17 @@
 """`rig evaluate`."""
 
+from collections.abc import Mapping
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.terminal import JsonFlag, print_json, print_table
+from rig.cli.terminal import JsonFlag, print_json, print_table, print_text
 
 if TYPE_CHECKING:
     from rig.diagnosis.problem.problem import RunEvaluation
+    from rig.recordings.gaps import Gaps
 
 EXAMPLES = (
     "Examples: `rig evaluate runs/9 --model model.yaml` · before and after a correction: "
@@ -40,15 +42,19 @@ def evaluate_command(
 
     specs = [load_named_model(name, Path()) for name in model]
     rows: list[tuple[str, RunEvaluation]] = []
+    gaps: dict[str, Gaps] = {}
     for name, spec in zip(model, specs, strict=True):
         struts = [strut.name for strut in spec.struts]
         recordings = [read_recording(path, struts) for path in runs]
+        gaps = {item.name: item.force_gaps for item in recordings if item.force_gaps is not None}
         rows += [(name, evaluation) for evaluation in evaluate_model(spec, recordings)]
     if as_json:
-        print_json({"schema": 1, "evaluations": [_as_dict(*row) for row in rows]})
+        print_json({"schema": 1, "evaluations": [_as_dict(*row, gaps) for row in rows]})
         return
     for run in dict.fromkeys(row.figures.run for _, row in rows):
         _print_run(run, [row for row in rows if row[1].figures.run == run])
+        if run in gaps:
+            print_text(gaps[run].report(run), "yellow")
 
 
 def _print_run(name: str, rows: "list[tuple[str, RunEvaluation]]") -> None:
@@ -74,7 +80,9 @@ def _print_run(name: str, rows: "list[tuple[str, RunEvaluation]]") -> None:
     print_table(heads, cells, f"{kind} of {name}")
 
 
-def _as_dict(model: str, evaluation: "RunEvaluation") -> dict[str, object]:
+def _as_dict(
+    model: str, evaluation: "RunEvaluation", gaps: "Mapping[str, Gaps]"
+) -> dict[str, object]:
     figures, floor = evaluation.figures, evaluation.floor
     cell = figures.strut_force_rmse_n
     return {
@@ -83,6 +91,7 @@ def _as_dict(model: str, evaluation: "RunEvaluation") -> dict[str, object]:
         "height_rmse_m": figures.height_rmse_m.after,
         "residual_force_rmse_n": figures.residual_force_rmse_n.after,
         "strut_force_rmse_n": None if cell is None else cell.after,
+        "applied_force_gaps": gaps[figures.run]._asdict() if figures.run in gaps else None,
         "noise_floor": {
             "height_rmse_m": floor.height_rmse_m,
             "residual_force_rmse_n": floor.residual_force_rmse_n,

@@ -13,8 +13,16 @@ if TYPE_CHECKING:
     from rig.diagnosis.outcome import Diagnosis
     from rig.run.logged_run import Ended
 
-_OF_TICKS = ("stale", "overruns", "limited", "bus_faulty", "left_out", "device_faulty")
-"""Counts of ticks; the others are of frames."""
+_OF_RUN = {
+    "lost": "frames lost (by their counters)",
+    "saturated": "frames sent with a value at the limit of its range",
+    "stale": "ticks in HOLD",
+    "limited": "ticks beyond a limit",
+    "bus_faulty": "ticks with a fault of the bus",
+    "left_out": "ticks without a further sensor",
+    "device_faulty": "ticks with a device at fault",
+}
+"""Counts in the table of a run, apart from refused frames and missed ticks, with their labels."""
 
 
 def print_case(case: "Case") -> None:
@@ -93,13 +101,29 @@ def _print_held_out(diagnosis: "Diagnosis") -> None:
     print_table(("on held-out data", "before", "after", "noise floor"), rows, "RMS error")
 
 
+def _modes(ended: "Ended") -> str:
+    """Share of a run's ticks in each mode."""
+    ticks = {mode: n for mode, n in ended.ticks_in_mode.items() if n}
+    shares = ((mode.name, n / max(sum(ticks.values()), 1)) for mode, n in ticks.items())
+    ordered = sorted(shares, key=lambda item: -item[1])
+    return " · ".join(f"{name} {100.0 * share:.3g} %" for name, share in ordered)
+
+
 def print_run(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
-    rows: list[tuple[str, str | Text]] = []
-    for name, value in ended.state.counts._asdict().items():
-        if value or name in ("lost", "refused", "overruns"):
-            what = "ticks" if name in _OF_TICKS else "frames"
-            rows.append((f"{name.replace('_', ' ')} ({what})", str(value)))
+    counts = ended.state.counts
+    missed = f"{counts.overruns}"
+    if counts.overruns:
+        missed += f" ({100.0 * counts.overruns / (ended.ticks + counts.overruns):.2g} %)"
+    refused = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in counts.refusals.items())
+    rows: list[tuple[str, str | Text]] = [
+        ("time in each mode", _modes(ended)),
+        ("ticks missed", missed),
+        ("frames refused", f"{counts.refused}" + (f" ({refused})" if refused else "")),
+    ]
+    for name, label in _OF_RUN.items():
+        if (value := getattr(counts, name)) or name == "lost":
+            rows.append((label, str(value)))
     if with_timing:
         timing = ended.timing
         for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):

@@ -18,6 +18,7 @@ from rig.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from rig.plan.plan import Plan
     from rig.tuning.tune import StatedExpectation, TunedStrut
 
 EXAMPLES = (
@@ -26,6 +27,9 @@ EXAMPLES = (
     "`rig tune rig.yaml --model found/corrected.yaml --run second --out corrected.yaml`"
 )
 
+
+_PROPOSED_LIMIT = 3.0
+"""Proposed limit of the stated standard deviation over the expected RMS error of the force."""
 
 _HARDLY = 0.8
 """Share of the configured observer's expected error above which tuning hardly helps."""
@@ -139,6 +143,7 @@ def tune_command(
     for path in (out, plot):
         if path is not None:
             print_text(f"Written: {path}")
+    _propose_limit(plan, struts, out or config)
     if out is not None:
         print_text(f"Next: `rig run {out}`")
 
@@ -248,7 +253,7 @@ def _print_errors(strut: "TunedStrut") -> None:
         ("settling time", *(_time_text(error.settling_s) for error in errors)),
         ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "", ""),
     ]
-    heads = ("expected error of the force", "tuned", "configured", "published gains")
+    heads = ("expected error of the force", "tuned", "configured", "PI (Cuesta et al., 2021)")
     print_table(heads, rows, f"Observer of “{strut.name}”")
     tuned_n, configured_n = strut.tuned.expected.force_n, strut.configured.force_n
     if tuned_n > _HARDLY * configured_n:
@@ -256,6 +261,30 @@ def _print_errors(strut: "TunedStrut") -> None:
             f"Tuning hardly helps: {tuned_n:.3g} N expected instead of {configured_n:.3g} N. A "
             "faster or less noisy height, or a model that lacks less, reduces the error further."
         )
+    residual_n = float(strut.expectation.power_n2.sum()) ** 0.5
+    if tuned_n > residual_n:
+        print_text(
+            f"The model alone errs by less: its residual force is {residual_n:.3g} N RMS. An "
+            "observer then only guards against a change of the bench; with a longer --settling-s "
+            "it adds less noise to the force."
+        )
+
+
+def _propose_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None:
+    """Propose a limit on the standard deviation that an observer states, where there is none."""
+    from rig.bridge.supervision_limits import LimitedValue
+
+    values = {row.value for row in plan.config.supervision.limits}
+    expected_n = [it.tuned.expected.force_n for it in struts if it.tuned.observer.knows_std]
+    if not expected_n or LimitedValue.FORCE_STD_N in values:
+        return
+    limit_n = float(f"{_PROPOSED_LIMIT * max(expected_n):.2g}")
+    print_text(
+        "An estimate remains valid however large a standard deviation it states. To hold one "
+        f"that is less certain than you accept, for example {_PROPOSED_LIMIT:g} times the "
+        f"expected error, add to supervision.limits in {file}: "
+        f"- {{value: force_std_n, high: {limit_n:g}, action: hold}}"
+    )
 
 
 def _time_text(time_s: float) -> str:

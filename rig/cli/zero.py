@@ -83,7 +83,7 @@ def zero_command(
         scale = {} if found.scale is None else {"scale": found.scale}
         print_json({"channel": channel.key, **readings._asdict(), **found.keys, **scale})
         return
-    _print(config, channel, readings, found)
+    _print(config, channel, readings, found, is_only_strut=len(plan.heights) == 1)
 
 
 def _channel(plan: "Plan", strut: str | None, tare: str | None) -> "Channel":
@@ -114,7 +114,14 @@ def _read(plan: "Plan", name: str, listen_s: float, run: Path | None) -> "Readin
         return readings_of(Path(folder) / "run", plan, name)
 
 
-def _print(config: Path, channel: "Channel", readings: "Readings", found: "Mounting") -> None:
+def _print(
+    config: Path,
+    channel: "Channel",
+    readings: "Readings",
+    found: "Mounting",
+    *,
+    is_only_strut: bool,
+) -> None:
     is_length = "zero" in found.keys
     scale, unit = (1e3, "mm") if is_length else (1.0, "N")
     print_text(
@@ -126,14 +133,16 @@ def _print(config: Path, channel: "Channel", readings: "Readings", found: "Mount
         print_text(f"{channel.key}.{key}: {value}")
     if found.scale is not None:
         print_text(
-            f"Over the two lengths the reading changed {abs(found.scale):.4g} times as much as the "
-            "length: 1 but for the errors of the rule, or the scale in the DBC is wrong"
+            f"Scale by the two lengths: {abs(found.scale):.4f}, expected 1 within the error of the "
+            "rule; otherwise the scale in the DBC is wrong"
         )
     print_text(f"Written: {config}")
     if is_length and found.scale is None:
+        strut = "" if is_only_strut else f" --strut {channel.name}"
         print_text(
-            "The direction is not known yet: bring the strut to another length and run "
-            f"`rig zero {config} --strut {channel.name} --length-m LENGTH` again."
+            "This length does not show the direction of the sensor. Next: bring the strut to a "
+            "second length, 5 mm or more away, and run "
+            f"`rig zero {config}{strut} --length-m LENGTH`"
         )
         return
     print_text(f"Next: `rig check {config}`")

@@ -13,7 +13,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal, alive_counter
 from can_dbc.errors import DatabaseError, InputError, expected_name
 from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
-from rig.bus.bus import BusConfig
+from rig.bus.bus import WITHOUT_BIT_RATE, BusConfig
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     HEIGHT,
@@ -264,7 +264,7 @@ class Proposal:
             *_rate(message.cycle_time_ns),
             f"model: {model}",
             f"dbc: {dbc}",
-            f"bus: {{interface: {bus.interface}, channel: {bus.channel}, bitrate: {bus.bitrate}}}",
+            _bus_line(bus),
             "signals:",
             *(line for choice in signals.choices for line in _signal_lines(choice)),
             *(
@@ -276,6 +276,11 @@ class Proposal:
             *_supervision(signals),
         ]
         return "\n".join(lines) + "\n"
+
+
+def _bus_line(bus: BusConfig) -> str:
+    rate = "" if bus.interface in WITHOUT_BIT_RATE else f", bitrate: {bus.bitrate}"
+    return f"bus: {{interface: {bus.interface}, channel: {bus.channel}{rate}}}"
 
 
 def _rate(interval_ns: int | None) -> list[str]:
@@ -440,6 +445,8 @@ def _supervision(signals: Signals) -> list[str]:
     lines += [
         "    # An estimate that is less certain than you accept: largest standard deviation, N.",
         "    # - {value: force_std_n, high: 100, action: hold}",
+        "    # The travel of the strut; without it, the range of the signal is the limit.",
+        "    # - {value: height_m, low: 0.1, high: 0.5, action: safe}",
     ]
     if signals.measures(Force.APPLIED):
         lines += [

@@ -178,14 +178,20 @@ def _zero(plan: Plan, height: Channel) -> Finding:
     """Whether a reading of a height's sensor is known to be the strut's length."""
     entry, what = plan.config.signals.height[height.name], f"zero of {height.name}"
     zero = entry.zero
+    one = len(plan.heights) == 1
+    measure = f"rig zero {plan.source}{'' if one else f' --strut {height.name}'} --length-m LENGTH"
     if zero is not None:
         text = f"a reading of {zero.reads * 1e3:g} mm is a length of {zero.at_m * 1e3:g} mm"
+        if "reversed" not in entry.model_fields_set:
+            text += f"; not known whether the sensor is reversed: expected {measure} at a second "
+            text += "length, or reversed: false"
+            return Finding(Severity.WARNING, what, text)
         return Finding(Severity.OK, what, text + (", reversed" if entry.reversed else ""))
     if _message(height).signal(height.signal).offset:
         return Finding(Severity.OK, what, "that of the DBC")
     text = "none was set: what the sensor reads counts as the strut's length; expected zero: "
-    text += f"{{reads, at_m}}, which rig zero {plan.source} --strut {height.name} --length-m LENGTH"
-    return Finding(Severity.WARNING, what, text + " measures, of any length that is known")
+    text += f"{{reads, at_m}}, which {measure} measures, at any length that is known"
+    return Finding(Severity.WARNING, what, text)
 
 
 def _rate(message: Message, period_ns: int) -> Finding:
@@ -370,8 +376,8 @@ def _limits(plan: Plan) -> list[Finding]:
     ]
     if may_freeze:
         text = f"none on unchanged_s of {' and '.join(may_freeze)}: a sensor that freezes before "
-        text += "the run, or as the motion turns, may not be noticed; expected one that is longer "
-        text += "than it repeats itself at rest"
+        text += "the run, or as the motion turns, may not be noticed; expected a limit that is "
+        text += "longer than the signal stays constant in normal operation"
         findings.append(Finding(Severity.WARNING, "limits of frozen sensors", text))
     for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
         severity = Severity.OK if rows else Severity.WARNING
@@ -469,7 +475,7 @@ def _settling(plan: Plan) -> list[Finding]:
         elif strut.observer.requires_height:
             text = f"{time_ns * 1e-9:.2g} s"
             if strut.observer.knows_std:
-                text += " after its variance has"
+                text += " from when the variance that it states has settled"
             findings.append(Finding(Severity.OK, subject, text))
     return findings
 
@@ -510,8 +516,9 @@ def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
         for pair in (of_strut[:2], of_strut[2:]):
             confused += map(_pair, observability(linear, measured, pair).confused)
     if confused:
-        text = f"indistinguishable: {'; '.join(confused)}: a law or a load cell separates them"
-        findings.append(Finding(Severity.OK, "limits of heights alone", text))
+        text = f"heights alone do not separate {', or '.join(confused)}: the laws of the model, or "
+        text += "a load cell, do"
+        findings.append(Finding(Severity.OK, "separability", text))
     for i in measured if len(measured) > 1 else ():
         result = observability(linear, [j for j in measured if j != i], forces)
         lost = [*(item.name for item in result.hidden), *map(_pair, result.confused)]

@@ -7,6 +7,7 @@ import numpy as np
 
 from can_dbc.errors import InputError, expected_name
 from rig.files.delimited_text import read_csv_columns
+from rig.recordings.gaps import find_gaps
 from rig.recordings.recording import Array, Recording, RecordingError
 
 COLUMNS = ("t_s", "height_m", "applied_force_n", "strut_force_n", "temperature_c")
@@ -46,6 +47,7 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         values.get("applied_force_n"),
         _stack_columns(cells, samples),
         values.get("temperature_c"),
+        find_gaps(values["t_s"]) if "applied_force_n" in values else None,
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
+from rig.recordings.gaps import Gaps
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,7 @@ class Recording:
         strut_forces_n: Load-cell force of each strut, shape (N, struts), a column of NaN for a
             strut without a cell; None where there is no cell.
         temperature_c: Damper temperature, shape (N,), or None.
+        force_gaps: Gaps over which the applied force is interpolated; None for none.
         sha256: Of the file, or of the run's steps, in hex; None where it was not read from one.
     """
 
@@ -34,6 +36,7 @@ class Recording:
     applied_force_n: Array | None = None
     strut_forces_n: Array | None = None
     temperature_c: Array | None = None
+    force_gaps: Gaps | None = None
     sha256: str | None = None
 
     @property

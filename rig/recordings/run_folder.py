@@ -19,6 +19,7 @@ from rig.log.checksums import refuse_damage
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_header
+from rig.recordings.gaps import find_gaps
 from rig.recordings.recording import Array, Recording, RecordingError
 
 
@@ -63,6 +64,7 @@ def read_run(folder: Path) -> Recording:
         applied_n,
         None if cell_n is None or len(heights) > 1 else cell_n[:, np.newaxis],
         _resample(payloads, temperature, t_s),
+        None if applied is None else find_gaps(_samples(payloads, applied)[0]),
     )
 
 

@@ -65,6 +65,7 @@ class Ended:
     granted: Granted | None
     log_fault: str | None
     ticks: int
+    ticks_in_mode: Mapping[Mode, int]
     period_ns: int
     diverged: Mapping[str, object] | None
     dropped_steps: int
@@ -226,6 +227,7 @@ class _LoggedRun:
             self._endpoint.granted,
             self._log.trouble,
             self._ticks,
+            dict(self._events.ticks),
             self._plan.period_ns,
             self._divergence(),
             self._log.dropped,

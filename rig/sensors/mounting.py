@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from can_dbc.addressing import Directory
 from can_dbc.errors import InputError, expected_name
 from rig.channels.channel import Channel, MeasuredSignal, Zero
 from rig.files.yaml_edit import set_keys
-from rig.log.reader import read_run
+from rig.log.reader import RunFolder, read_run
 from rig.plan.plan import Plan
 from rig.recordings.run_folder import read_channel
 from rig.run.live import live
@@ -109,14 +110,33 @@ def readings_of(run: Path, plan: Plan, name: str) -> Readings:
         InputError: The run is damaged, or has fewer than ten of them.
     """
     channel = find_channel(plan, name)
-    t_s, values = read_channel(read_run(run), channel)
+    log = read_run(run)
+    t_s, values = read_channel(log, channel)
     if len(values) < _FEWEST:
-        message = "" if channel.message is None else channel.message.name
-        raise InputError(
-            f"height or force of {name}: {len(values)} valid frames of {message}, expected at "
-            f"least {_FEWEST}: is the sensor powered, the bus the right one, and its message too?"
-        )
+        raise InputError(f"{channel.key}: {_what_came(log, channel, len(values))}")
     return summarise(t_s, values)
+
+
+def _what_came(run: RunFolder, channel: Channel, valid: int) -> str:
+    """What arrived of a channel instead of its readings, and what to do."""
+    received = [frame for frame, direction in run.frames() if direction == "R"]
+    if not received or channel.message is None:
+        return (
+            "no frames arrived at all, expected some: is the bench sending, and are interface, "
+            "channel and bit rate those of its bus?"
+        )
+    message, directory = channel.message.name, Directory([channel.message])
+    own = sum(directory.index_of(f.arbitration_id, f.is_extended) is not None for f in received)
+    if not own:
+        return (
+            f"{len(received)} frames arrived, but none of {message}: is the sensor powered, and is "
+            "this its message?"
+        )
+    return (
+        f"{own} frames of {message} arrived, of which {valid} hold a valid reading, expected at "
+        f"least {_FEWEST}: what does the sensor's valid signal report, and does the DBC have its "
+        "length and checksum?"
+    )
 
 
 def summarise(t_s: Array, values: Array) -> Readings:
@@ -163,8 +183,8 @@ def find_zero(
     zero: dict[str, object] = {"reads": round(readings.mean, 7), "at_m": length_m}
     last = None if is_remounted else before.zero
     scale = None if last is None else _scale(readings.mean, length_m, last)
-    is_reversed = before.reversed if scale is None else scale < 0.0
-    return Mounting({"zero": zero, "reversed": is_reversed}, scale)
+    direction: dict[str, object] = {} if scale is None else {"reversed": scale < 0.0}
+    return Mounting({"zero": zero, **direction}, scale)
 
 
 def _scale(reads: float, length_m: float, last: Zero) -> float | None:

@@ -1,9 +1,12 @@
 """Models evaluated on runs: a right one at the noise floor, a wrong one as its diagnosis has it."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
@@ -11,6 +14,8 @@ from dart_model.spec import dump_model
 from rig.cli.main import app
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.evaluate import evaluate_model
+from rig.recordings.gaps import find_gaps
+from rig.recordings.read import read_recording
 from tests.diagnosis import little_bench, little_dyno
 
 HEAVY = 1.1 * little_bench.MASS
@@ -61,3 +66,36 @@ def test_models_side_by_side_on_the_terminal_and_as_json(tmp_path):
     assert wrong["height_rmse_m"] > 10.0 * right["height_rmse_m"]
     refused = CliRunner().invoke(app, ["evaluate", str(tmp_path / "gone.csv"), *options])
     assert isinstance(refused.exception, InputError)
+
+
+def test_gaps_of_the_applied_force_are_reported(tmp_path):
+    run = little_bench.run(little_bench.Nothing(), duration_s=6.0)
+    table = np.column_stack([run.t_s, run.heights_m[:, 0], run.applied_force_n])
+    kept = np.ones(len(table), dtype=bool)
+    kept[400:425] = kept[800] = False  # 25 of 250 a second, and one by itself
+    header = "t_s,height_m,applied_force_n"
+    for name, rows in (("whole", table), ("gap", table[kept])):
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header=header, comments="")
+    (tmp_path / "right.yaml").write_text(dump_model(little_bench.model()))
+    arguments = [str(tmp_path / "whole.csv"), str(tmp_path / "gap.csv")]
+    arguments += ["--model", str(tmp_path / "right.yaml")]
+    printed = CliRunner().invoke(app, ["evaluate", *arguments]).output
+    assert "gap.csv: the applied force is missing in 1 gap" in printed
+    assert "up to 0.1 s" in " ".join(printed.split())
+    assert "whole.csv: the applied force" not in printed
+    runs = [read_recording(Path(path)) for path in arguments[:2]]
+    notes = diagnose(little_bench.model(), runs[:1], runs[1:]).diagnosis.notes
+    assert runs[1].force_gaps is not None
+    assert runs[1].force_gaps.report("gap.csv") in notes
+
+
+@given(st.lists(st.integers(1, 6), min_size=20, max_size=60))
+def test_gaps_are_where_two_samples_are_missing(steps):
+    steps = [1] * (len(steps) + 3) + steps
+    gaps = find_gaps(np.cumsum(steps) * 0.002)
+    long = [step for step in steps[1:] if step >= 3]
+    assert (gaps is None) == (not long)
+    if gaps is not None:
+        assert gaps.number == len(long)
+        assert gaps.longest_s == pytest.approx(0.002 * max(long))
+        assert gaps.share == pytest.approx(sum(long) / sum(steps[1:]))

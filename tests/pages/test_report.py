@@ -325,7 +325,7 @@ def test_effects_of_the_nominal_model_that_the_data_change_are_listed() -> None:
     listed = text.split("Effects of the nominal model that the data change")[1]
     assert "strut strut, refitted" in listed
     assert "10.0 N 12.08 N 11.83 to 12.36 N" in listed
-    assert "superfluous: without it, the data are explained as well" in listed
+    assert "superfluous on these data: without it" in listed
     said = sentence(diagnosis, 1)
     assert "effect “coulomb_friction” is refitted; its effect “bump_stop” is superfluous" in said
     assert "changes of its effects (“coulomb_friction” refitted" in sentence(

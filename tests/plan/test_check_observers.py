@@ -52,7 +52,7 @@ def test_senseless_filters_are_refused_in_a_line(tmp_path, bandwidth_hz, noise_s
 
 
 def test_what_heights_cannot_tell_stands_in_words(tmp_path):
-    found = findings(tmp_path)["limits of heights alone"].text
+    found = findings(tmp_path)["separability"].text
     assert "the spring's force of strut and the damper's" in found
     assert "a preload of strut and an offset of its height sensor" in found
 

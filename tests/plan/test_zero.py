@@ -82,8 +82,14 @@ def limits_of_strut(folder, more):
 @pytest.mark.parametrize(
     ("given", "dbc", "severity", "text"),
     [
-        ({}, AS_IS, Severity.WARNING, "none was set: .* rig zero .*my.yaml --strut strut --length"),
+        ({}, AS_IS, Severity.WARNING, "none was set: .* rig zero .*my.yaml --length"),
         (ZERO, DRAW_WIRE, Severity.OK, r"a reading of 250 mm is a length of 0 mm, reversed"),
+        (
+            {"zero": ZERO["zero"]},
+            DRAW_WIRE,
+            Severity.WARNING,
+            "not known whether the sensor is reversed: expected rig zero .*my.yaml --length",
+        ),
         ({}, AS_IS.replace(",0)", ",0.2)"), Severity.OK, "that of the DBC"),
     ],
 )

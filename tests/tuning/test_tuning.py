@@ -150,7 +150,10 @@ def test_the_command(late, monkeypatch, capsys, tmp_path):
     asked = ("tune", late / "rig.yaml", "--residual-n", 60, "--up-to-hz", 5)
     assert rig(monkeypatch, *asked, "--plot", tmp_path / "plot.png") == 0
     said = capsys.readouterr().out
-    assert "published gains" in said
+    assert "PI (Cuesta et al., 2021)" in said
+    assert "add to supervision.limits in" in said
+    row = said[said.index("{value: force_std_n") :]
+    limit = yaml.safe_load(row[: row.index("}") + 1].replace("\n", " "))
     assert "configured" in said
     assert "Tuning hardly helps" not in said
     assert (tmp_path / "plot.png").stat().st_size > 10_000
@@ -158,6 +161,7 @@ def test_the_command(late, monkeypatch, capsys, tmp_path):
     [found] = json.loads(capsys.readouterr().out)
     assert found["observer"]["kind"] == "kalman"
     parts = found["expected_force_error_n"]
+    assert limit["high"] == pytest.approx(3.0 * parts["all"], rel=0.05)
     assert parts["all"] == pytest.approx(np.hypot(parts["noise"], parts["lag"]))
 
 

@@ -79,11 +79,14 @@ def linear(diagnosis: Diagnosis) -> tuple[Row, ...]:
 def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
     """Missing effects, with their parameters."""
     tables: list[EffectTable] = []
-    for item in missing(diagnosis):
+    lacking = missing(diagnosis)
+    overlap = " (such shares overlap)" * (len(lacking) > 1)
+    for item in lacking:
         law = effect(item.name)
         note = (
             f"family {item.family}, strut {item.strut}, {quantity(item.force_rms_n, 'N')} RMS, "
             f"explains {percent(item.explained_fraction, 0)} of the residual force without it"
+            f"{overlap}"
         )
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))
     return tuple(tables)
@@ -94,7 +97,10 @@ def existing(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
     tables: list[EffectTable] = []
     for item in diagnosis.existing:
         law = effect(item.name)
-        superfluous = "superfluous: without it, the data are explained as well"
+        superfluous = (
+            "superfluous on these data: without it, and with the others refitted, the error is the "
+            "same; it remains in corrected.yaml"
+        )
         note = f"strut {item.strut}, {'refitted' if item.change == 'refitted' else superfluous}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, item.nominal)))
     return tuple(tables)

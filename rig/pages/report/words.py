@@ -222,7 +222,7 @@ def _not_explained(diagnosis: Diagnosis) -> str:
     if not (corrected and falls):
         return f"{start}: {name} is {before}{_or_else(diagnosis)}."
     words = join_words([effect(item.name).words for item in diagnosis.effects], "and")
-    nearest = f"the nearest, {words or 'a correction of what it has'}, takes"
+    nearest = f"the best model found, with {words or 'linear corrections alone'}, takes"
     if diagnosis.effects and diagnosis.effects[0].family == "restoring_surface":
         nearest = (
             "a table of force over height and velocity, which names no cause, is offered and takes"
