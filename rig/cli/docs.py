@@ -2,11 +2,14 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rig.cli.terminal import EXIT_CODES, JsonFlag, print_json, print_text
+
+if TYPE_CHECKING:
+    from rig.guide.site import Block
 
 EXAMPLES = "Example: `rig docs guide`, then open guide/index.html"
 
@@ -17,15 +20,20 @@ def docs(
     as_json: JsonFlag = False,
 ) -> None:
     """Build the guide as a web site that works without a network."""
-    from rig.guide.reference import generated_blocks
     from rig.guide.site import build_site
 
-    blocks = generated_blocks(lambda: "\n\n".join(_commands(context.parent)), EXIT_CODES)
-    index = build_site(folder, blocks)
+    index = build_site(folder, guide_blocks(context.parent))
     if as_json:
         print_json({"written": str(index)})
     else:
         print_text(f"Written: {index}")
+
+
+def guide_blocks(parent: Any) -> dict[str, "Block"]:
+    """Generated parts of the guide, those of the command line of a context among them."""
+    from rig.guide.reference import generated_blocks
+
+    return generated_blocks(lambda: "\n\n".join(_commands(parent)), EXIT_CODES)
 
 
 def _commands(parent: Any, prefix: str = "rig") -> Iterator[str]:

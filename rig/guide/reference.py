@@ -161,7 +161,7 @@ def _of_family(family: str) -> list[Effect]:
     return [item for item in CATALOGUE.values() if item.family == family]
 
 
-def _effects(pictures: Path) -> str:
+def _effects(pictures: Path | None) -> str:
     """Every effect: parameters, formula, literature, and its force along a harmonic motion."""
     parts: list[str] = []
     for family, words in FAMILY_WORDS.items():
@@ -172,7 +172,7 @@ def _effects(pictures: Path) -> str:
     return "\n\n".join(parts)
 
 
-def _effect(item: Effect, pictures: Path) -> str:
+def _effect(item: Effect, pictures: Path | None) -> str:
     rows = [
         (f"`{it.name}`", it.unit or "-", f"{it.low:g} to {it.high:g}", it.meaning)
         for it in item.parameters[:_MOST_PARAMETERS]
@@ -193,7 +193,7 @@ def _effect(item: Effect, pictures: Path) -> str:
         parts.append(
             "Rate of its internal states:\n\n```python\n" + _formula("rate", item.rate) + "\n```"
         )
-    if _draw(item, pictures / f"{item.name}.svg"):
+    if pictures is not None and _draw(item, pictures / f"{item.name}.svg"):
         parts.append(
             f"![Force of {item.name} over height and over velocity](../generated/{item.name}.svg)"
         )

@@ -1,8 +1,9 @@
 """The guide as a web site: Markdown pages, what the code knows put into them, built by MkDocs.
 
-A page holds a quotation that ends with `<!-- generated: NAME -->` where a list or table stands that
-code knows. It is written there when the site is built, so that no page can contradict the program.
-Everything the site needs is in its folder: pages and search work from a file, without a network.
+Lists and tables that the code knows stand in a page between `<!-- generated: NAME -->` and
+`<!-- end -->`. They are written again when the site is built, with pictures, so that no page can
+contradict the program. Everything the site needs is in its folder: pages and search work from a
+file, without a network.
 """
 
 import importlib
@@ -21,11 +22,11 @@ from rig.machine.installed_versions import version_of
 PAGES = Path(__file__).with_name("pages")
 """Folder of the pages."""
 
-GENERATED = re.compile(r"^> .*<!-- generated: ([\w-]+) -->$", re.MULTILINE)
-"""Where a page has what code knows."""
+GENERATED = re.compile(r"^<!-- generated: ([\w-]+) -->$.*?^<!-- end -->$", re.MULTILINE | re.DOTALL)
+"""A part of a page that code knows."""
 
-Block = Callable[[Path], str]
-"""Markdown of a generated part; pictures are written into the folder that it is given."""
+Block = Callable[[Path | None], str]
+"""Markdown of a generated part; pictures are written into the folder that it is given, if any."""
 
 _PICTURES = "generated"
 """Folder of generated pictures, below that of the pages."""
@@ -161,16 +162,28 @@ def _fill(source: Path, blocks: Mapping[str, Block]) -> None:
     pictures = source / _PICTURES
     pictures.mkdir()
     for page in sorted(source.rglob("*.md")):
-        text = page.read_text("utf-8")
+        page.write_text(fill_page(page, blocks, pictures), "utf-8")
 
-        def filled(match: re.Match[str], page: Path = page) -> str:
-            if match[1] not in blocks:
-                raise InputError(f"{page.name}: no generated part {match[1]!r}")
-            return blocks[match[1]](pictures)
 
-        changed = GENERATED.sub(filled, text)
-        if changed != text:
-            page.write_text(changed, "utf-8")
+def fill_page(page: Path, blocks: Mapping[str, Block], pictures: Path | None) -> str:
+    """Text of a page with its generated parts written again.
+
+    Args:
+        page: Markdown file.
+        blocks: Generated parts, by their names.
+        pictures: Folder for their pictures; without one they have none.
+
+    Raises:
+        InputError: The page names a part that there is not.
+    """
+
+    def fill(match: re.Match[str]) -> str:
+        name = match[1]
+        if name not in blocks:
+            raise InputError(f"{page.name}: no generated part {name!r}")
+        return f"<!-- generated: {name} -->\n\n{blocks[name](pictures).strip()}\n\n<!-- end -->"
+
+    return GENERATED.sub(fill, page.read_text("utf-8"))
 
 
 def _entry(source: Path, page: Path) -> dict[str, str]:

@@ -11,7 +11,8 @@ import typer
 from rig.bridge.mode_supervisor import Event
 from rig.cli.main import app
 from rig.guide.reference import generated_blocks
-from rig.guide.site import GENERATED, PAGES
+from rig.guide.site import GENERATED, PAGES, fill_page
+from tests.guide.generated import blocks
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *sorted(PAGES.rglob("*.md"))]
@@ -89,6 +90,14 @@ def test_links_of_the_readme_lead_somewhere():
 def test_each_generated_part_stands_in_a_page():
     named = {name for path in TEXTS for name in GENERATED.findall(path.read_text("utf-8"))}
     assert named == set(generated_blocks(str, {}))
+
+
+@pytest.mark.parametrize(
+    "path", [it for it in TEXTS if GENERATED.search(it.read_text("utf-8"))], ids=name_of
+)
+def test_generated_parts_are_those_of_the_code(path):
+    """`python -m tests.guide` writes them again."""
+    assert path.read_text("utf-8") == fill_page(path, blocks(), None)
 
 
 def test_each_cause_of_a_mode_is_explained():

@@ -82,7 +82,7 @@ def test_a_missing_generator_and_a_link_that_leads_nowhere_are_one_line(tmp_path
     monkeypatch.setattr(guide, "_NAVIGATION", {})
     with pytest.raises(InputError, match=r"cannot be built: .*nowhere\.md"):
         build_site(tmp_path / "site", {})
-    (pages / "index.md").write_text("# One\n\n> Here. <!-- generated: nothing -->\n")
+    (pages / "index.md").write_text("# One\n\n<!-- generated: nothing -->\n<!-- end -->\n")
     with pytest.raises(InputError, match=r"index\.md: no generated part 'nothing'"):
         build_site(tmp_path / "other", {})
     monkeypatch.setitem(sys.modules, "material", None)
