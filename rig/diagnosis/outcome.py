@@ -220,6 +220,8 @@ class FittedSeries:
         residual_before_n: Force that the nominal model lacks.
         residual_after_n: Force that the corrected model lacks.
         residual_std_n: Standard deviation of either, from the smoother.
+        damper_before_n: Force of the nominal model's strut without linear spring and preload.
+        damper_after_n: The same of the corrected model.
     """
 
     run: str
@@ -230,6 +232,8 @@ class FittedSeries:
     residual_before_n: Array
     residual_after_n: Array
     residual_std_n: Array
+    damper_before_n: Array
+    damper_after_n: Array
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from rig.diagnosis.outcome import (
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
+    CandidateModel,
     LinearParameter,
     Problem,
     ResidualForces,
@@ -35,7 +36,7 @@ from rig.diagnosis.problem.problem import (
     rms,
     slots_of,
 )
-from rig.diagnosis.problem.track import forces_along
+from rig.diagnosis.problem.track import force_beyond_spring, forces_along
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import (
     UNBOUND,
@@ -125,7 +126,8 @@ def compose_result(
         tuple(grid.name for grid in problem.grids),
         problem.spec.name,
     )
-    series = (_collect_series(problem, before[k], after[k]) for k in recordings)
+    models = search.given.model, chosen.model
+    series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)
     return Result(
         diagnosis,
         spec_with_corrections(problem, chosen.model),
@@ -338,10 +340,19 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
 
 
 def _collect_series(
-    problem: Problem, before: ResidualForces | None, after: ResidualForces | None
+    problem: Problem,
+    k: int,
+    models: tuple[CandidateModel, CandidateModel],
+    forces: tuple[ResidualForces | None, ResidualForces | None],
 ) -> list[FittedSeries]:
+    """Series of a recording, by the nominal and the corrected model."""
+    before, after = forces
     if before is None or after is None:
         return []
+    damper_n = [
+        force_beyond_spring(problem, model, after.track, problem.states(k, model))
+        for model in models
+    ]
     return [
         FittedSeries(
             after.name,
@@ -352,6 +363,7 @@ def _collect_series(
             before.force_n[i],
             after.force_n[i],
             after.deviation_n[i],
+            *(force[i] for force in damper_n),
         )
         for i, strut in enumerate(problem.spec.struts)
         if np.all(np.isfinite(after.force_n[i]))

@@ -35,7 +35,11 @@ def test_a_right_model_is_at_the_noise_floor_and_a_wrong_one_is_not():
 def test_the_error_is_that_before_the_correction_in_a_diagnosis():
     runs = [little_bench.run(little_bench.Nothing(), seed=seed) for seed in (1, 2)]
     spec = little_bench.model(mass=HEAVY)
-    found = diagnose(spec, runs[:1], runs[1:]).diagnosis
+    result = diagnose(spec, runs[:1], runs[1:])
+    found = result.diagnosis
+    [series] = result.fitted
+    linear_n = -spec.struts[0].damping_n_s_per_m * series.velocity_m_per_s
+    assert np.allclose(series.damper_before_n, linear_n)
     [alone] = evaluate_model(spec, runs[1:])
     before = found.held_out.height_rmse_m.before
     assert alone.figures.height_rmse_m.after == pytest.approx(before, rel=1e-3)

@@ -109,7 +109,7 @@ def fitted(count: int = 3000, run: str = "sweep.csv") -> FittedSeries:
     noise = random.normal(0.0, 0.3, count)
     return FittedSeries(
         run, "strut", t_s, height, velocity, noise - 12.0 * np.sign(velocity), noise,
-        np.full(count, 0.3),
+        np.full(count, 0.3), -100.0 * velocity, -100.0 * velocity - 12.0 * np.sign(velocity),
     )  # fmt: skip
 
 
@@ -444,7 +444,7 @@ def test_recordings_without_motion_or_samples_give_a_page() -> None:
     still = np.full(30, 0.4)
     nothing = np.full(30, np.nan)
     t_s = np.arange(30) * 1e-3
-    rest = FittedSeries("rest", "strut", t_s, still, 0 * still, nothing, nothing, nothing)
+    rest = FittedSeries("rest", "strut", t_s, still, 0 * still, *[nothing] * 5)
     for unit in ("m", "N"):
         lost = HeldOutSeries("x", "strut", unit, t_s, nothing, still, still, nothing, nothing)
         page(report(fitted=(rest,), held_out=(lost,)))
@@ -544,7 +544,7 @@ def test_a_spectrum_has_the_power_of_its_residual() -> None:
     random = np.random.default_rng(2)
     noise = random.normal(0.0, 0.5, len(t_s))
     zero = np.zeros(len(t_s))
-    density = spectrum((FittedSeries("r", "s", t_s, zero, zero, tone, noise, zero),))
+    density = spectrum((FittedSeries("r", "s", t_s, zero, zero, tone, noise, zero, zero, zero),))
     assert density is not None
     width = density.frequency_hz[1] - density.frequency_hz[0]
     peak = density.frequency_hz[np.argmax(density.before_n_per_sqrt_hz)]

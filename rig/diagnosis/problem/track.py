@@ -159,6 +159,16 @@ def forces_along(
     ]
 
 
+def force_beyond_spring(
+    problem: Problem, model: CandidateModel, track: Track, states: Array
+) -> Array:
+    """Force of every strut without that of its linear spring and its preload, shape (struts, N)."""
+    constants = strut_constants(problem, model.parts.linear)
+    free, stiffness, preload = constants[:, [0, 1, 4], np.newaxis].transpose(1, 0, 2)
+    spring = preload - stiffness * (track.heights_m - free)
+    return strut_forces(problem, model, track, states) - spring
+
+
 def strut_forces(problem: Problem, model: CandidateModel, track: Track, states: Array) -> Array:
     """Force of every strut of a model along a motion, shape (struts, N)."""
     constants = strut_constants(problem, model.parts.linear)

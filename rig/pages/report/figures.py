@@ -134,6 +134,32 @@ def corrected_residual_plot(key: str, series: Sequence[FittedSeries], points: in
     return plot(key, "Residual force of the corrected model", caption, panels, 2)
 
 
+def damper_plot(
+    key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle], points: int
+) -> Plot:
+    """Force of the model's strut without its linear spring, over velocity and height."""
+    columns = [
+        np.column_stack(
+            [
+                run.height_m * HEIGHT.report_factor,
+                run.velocity_m_per_s,
+                run.damper_before_n,
+                run.damper_after_n,
+                np.zeros(len(run.t_s)),
+            ]
+        )
+        for run in series
+    ]
+    panels = _clouds(join(series, columns), shown, points, label="damper force / N")
+    caption = (
+        "The force of the model's strut along the recordings, without linear spring and preload: "
+        "damper, friction and stops together, positive when they push the bodies apart. Where "
+        "several laws describe one damper, their parameters overlap, and this sum is what the "
+        "recordings determine."
+    )
+    return plot(key, "Damper force of the model", caption, panels[::-1], 2)
+
+
 def surface_plot(
     key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle]
 ) -> Plot | None:
@@ -242,7 +268,12 @@ def _reach_n(joined: Joined) -> float:
 
 
 def _clouds(
-    joined: Joined, shown: Sequence[LineStyle], points: int, *, first: int = 0
+    joined: Joined,
+    shown: Sequence[LineStyle],
+    points: int,
+    *,
+    first: int = 0,
+    label: str = RESIDUAL_FORCE.report_label,
 ) -> list[Panel]:
     there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
     panels: list[Panel] = []
@@ -251,7 +282,7 @@ def _clouds(
         kept = there[cloud(against[there], joined.values[there, 2:4], points // 2)]
         values = [joined.values[kept, 2 + index] for index in range(first, len(shown))]
         extra = {"reach": _finite(_reach_n(joined))}
-        labels = quantity.report_label, RESIDUAL_FORCE.report_label
+        labels = quantity.report_label, label
         panels.append(Panel("points", *labels, against[kept], shown[first:], values, extra))
     return panels
 

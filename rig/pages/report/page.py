@@ -12,6 +12,7 @@ from rig.pages.report.figures import (
     Plot,
     corrected_residual_plot,
     curves,
+    damper_plot,
     held_out_plot,
     residual_plot,
     surface_plot,
@@ -115,6 +116,7 @@ def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]
             plots.append(residual_plot(f"residual-{index}", fitted, styles, points))
             if corrected:
                 plots.append(corrected_residual_plot(f"left-{index}", fitted, points))
+            plots.append(damper_plot(f"damper-{index}", fitted, styles, points))
             plots.append(surface_plot(f"surface-{index}", fitted, styles))
         groups.append((strut, [plot for plot in plots if plot is not None]))
     return tuple(groups)
