@@ -58,8 +58,10 @@ def diagnose(
         print_text(f"Printed: {out}/report.pdf")
     if result.diagnosis.verdict == "partly_explained":
         others = "".join(f" --held-out {path}" for path in held_out or [])
+        left_n = result.diagnosis.held_out.residual_force_rmse_n.after
         print_text(
-            "More is missing: diagnose once more what the corrected model lacks, by `rig diagnose "
+            f"The corrected model still lacks {left_n:.3g} N RMS. If that matters for your purpose, "
+            "diagnose once more what it lacks: `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )
     is_driven = result.diagnosis.held_out.strut_force_rmse_n is None

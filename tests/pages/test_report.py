@@ -216,7 +216,7 @@ class Reader(HTMLParser):
         (
             found("explained", (STIFFNESS,), linear=(SOFTER,)),
             [
-                "The model's linear part is off: stiffness 13 % below the file's, 783 N/m "
+                "The model's linear part is off: stiffness 13 % below the given model's, 783 N/m "
                 "(95 % interval 771 to 795 N/m); nothing is missing: with this correction the RMS",
                 "falls from 2.31 mm to 10.4 µm",
             ],
@@ -225,7 +225,7 @@ class Reader(HTMLParser):
             found("explained", (FRICTION,), linear=(SOFTER, PRELOAD)),
             [
                 "The model lacks dry friction (Coulomb)",
-                "in addition to linear corrections (stiffness 13 % below the file's, "
+                "in addition to linear corrections (stiffness 13 % below the given model's, "
                 "preload 12.3 N above",
                 "with these corrections the RMS free-run height error",
             ],
@@ -286,14 +286,14 @@ def test_linear_corrections_stand_apart_from_what_is_missing() -> None:
     linear, missing = text.split("Linear part", 1)[1].split("Missing effects", 1)
     for part in (
         "stiffness about mid-stroke (0.38 m)",
-        "900 N/m 783 N/m 771 to 795 N/m 13 % below the file's",
+        "900 N/m 783 N/m 771 to 795 N/m 13 % below the given model's",
         "preload about mid-stroke (0.38 m)",
-        "0 N 12.30 N 11.90 to 12.70 N 12.3 N above the file's",
+        "0 N 12.30 N 11.90 to 12.70 N 12.3 N above the given model's",
         "damping damping_n_s_per_m 20.0 N·s/m 23.1 N·s/m not identifiable from these data "
         "16 % above",
-        "9.500 to 9.600 kg 4.5 % below the file's",
+        "9.500 to 9.600 kg 4.5 % below the given model's",
         "input gain",
-        "1.040 to 1.060 5.0 % above the file's",
+        "1.040 to 1.060 5.0 % above the given model's",
     ):
         assert part in linear
     assert "dry friction" not in linear

@@ -66,7 +66,7 @@ def difference(item: LinearCorrection) -> str:
     else:
         percent = 100.0 * abs(change / item.nominal)
         amount = f"{number(percent, decimals_of(percent))}\u00a0%"
-    return f"{amount} {'above' if change > 0.0 else 'below'} the file's"
+    return f"{amount} {'above' if change > 0.0 else 'below'} the given model's"
 
 
 def linear_label(item: LinearCorrection) -> str:
