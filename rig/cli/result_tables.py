@@ -106,7 +106,7 @@ def _modes(ended: "Ended") -> str:
     ticks = {mode: n for mode, n in ended.ticks_in_mode.items() if n}
     shares = ((mode.name, n / max(sum(ticks.values()), 1)) for mode, n in ticks.items())
     ordered = sorted(shares, key=lambda item: -item[1])
-    return " · ".join(f"{name} {100.0 * share:.3g} %" for name, share in ordered)
+    return " · ".join(f"{name} {100.0 * share:.1f} %" for name, share in ordered)
 
 
 def print_run(ended: "Ended", *, with_timing: bool) -> None:

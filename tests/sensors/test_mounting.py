@@ -161,3 +161,14 @@ def test_lengths_that_are_near_leave_the_direction_as_it_was(change_m):
     found = find_zero(readings, 0.4 + change_m, before, is_remounted=False)
     assert "reversed" not in found.keys
     assert found.scale is None
+
+
+def test_what_arrived_instead_of_a_reading(tmp_path, runs):
+    path = config(tmp_path)
+    silent = zero(path, "--length-m", 0.36, "--listen-s", 0.2)  # a virtual bus without a bench
+    assert "signals.height.strut: no frames arrived at all" in str(silent.exception)
+    content = yaml.safe_load(path.read_text())
+    content["signals"]["height"] = {"message": "BENCH_MEASUREMENT_2", "signal": "HEIGHT"}
+    path.write_text(yaml.safe_dump(content))
+    other = zero(path, "--length-m", 0.36, "--run", runs[0.36])
+    assert "frames arrived, but none of BENCH_MEASUREMENT_2" in str(other.exception)
