@@ -60,7 +60,7 @@ def diagnose(
         others = "".join(f" --held-out {path}" for path in held_out or [])
         left_n = result.diagnosis.held_out.residual_force_rmse_n.after
         print_text(
-            f"The corrected model still lacks {left_n:.3g} N RMS. If that matters for your purpose, "
+            f"The corrected model still lacks {left_n:.3g} N RMS. If that matters for your use, "
             "diagnose once more what it lacks: `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )

@@ -130,7 +130,8 @@ class Overview:
             self.others
         )
         return (
-            f"{self.runs} runs of {dampers} dampers on {len(self.verdicts)} benches, model "
+            f"{_count(self.runs, 'run')} of {_count(dampers, 'damper')} on "
+            f"{_count(len(self.verdicts), 'bench', 'benches')}, model "
             f"{self.model}{left_out}"
         )
 
@@ -171,6 +172,10 @@ class Overview:
                 for item in self.outliers
             ],
         }
+
+
+def _count(number: int, noun: str, plural: str = "") -> str:
+    return f"{number} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def date_of(day: float) -> str:

@@ -120,9 +120,11 @@ def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> 
     `stepped_on` is the day of a step of unknown size that is not its own.
     """
     days = np.array([point.day for point in points])
+    if len(np.unique(days)) < 3:
+        return None
     columns = _line_and_step(days, stepped_on)
     free = len(days) - columns.shape[1]
-    if len(np.unique(days)) < 3 or free < 1:
+    if free < 1:
         return None
     y = np.array([point.value for point in points])
     weights = np.linalg.lstsq(columns, y, rcond=None)[0]

@@ -248,9 +248,10 @@ class _LoggedRun:
             self._shown_ns = t_ns + SHOWN_EVERY_NS
             is_paced = self._endpoint.granted is not None
             late_ns = int(self._timing.extremes_ns[0]) if is_paced else None
+            passed = self._ticks + result.counts.overruns
             self._control.watch(
                 Look(
-                    t_ns,
+                    passed * self._plan.period_ns,
                     self._ticks,
                     result.output,
                     result.counts,

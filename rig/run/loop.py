@@ -47,7 +47,11 @@ SHOWN_EVERY_NS = 200_000_000
 
 
 class Look(NamedTuple):
-    """A look at a run after a number of ticks; without a clock there is no lateness."""
+    """A look at a run after a number of ticks; without a clock there is no lateness.
+
+    Attributes:
+        t_ns: Time since the first tick, missed ones included.
+    """
 
     t_ns: int
     ticks: int

@@ -261,11 +261,12 @@ function control() {
   at("key").replaceChildren(...keys.map(([key, value]) => new Option(`${key} (${value} at the start)`, key)));
 }
 
-// Keys and values of all numbers in a section; null is a limit that is not set.
+// Keys and values of all numbers in a section; null is a limit that is not set. A filter cannot be
+// changed during a run.
 function numbers(key, value) {
   if (value === null || typeof value === "number") return [[key, value ?? "none"]];
   if (typeof value !== "object") return [];
-  return Object.entries(value).flatMap(([name, item]) => numbers(`${key}.${name}`, item));
+  return Object.entries(value).filter(([name]) => name !== "filter").flatMap(([name, item]) => numbers(`${key}.${name}`, item));
 }
 
 async function demand(action, run, content) {
