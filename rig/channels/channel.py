@@ -50,7 +50,8 @@ class Zero(BaseModel):
     """A reading of a position sensor at a known length of the strut; `rig zero` measures it.
 
     Attributes:
-        reads: Reading of the sensor in m, after the scaling of the DBC or of a mapping.
+        reads: Reading of the sensor in m, after its scaling: by the DBC, or by a mapping's gain and
+            unit.
         at_m: Length of the strut at that reading, in m.
     """
 
@@ -77,7 +78,8 @@ class MeasuredSignal(SignalName):
             length.
         reversed: True if the reading falls while the quantity grows; for a height with a zero, a
             velocity or a force.
-        tare_n: For a force: the reading without a force in N, after the same scaling; 0 if absent.
+        tare_n: For a force: the reading without a force, in N after the scaling by the DBC, and
+            before a reversal; 0 if absent.
     """
 
     valid: ValidSignal | None = None

@@ -245,8 +245,7 @@ class _File(_Section):
 
     Attributes:
         kind: `file`: a column of a CSV file.
-        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n` or
-            `height_m`.
+        path: CSV file in the configuration's folder.
     """
 
     column: ClassVar[str]
@@ -267,13 +266,21 @@ class _File(_Section):
 
 
 class ForceFile(_File):
-    """A force from column `applied_force_n`, straight between samples, zero outside them."""
+    """A force from column `applied_force_n`, straight between samples, zero outside them.
+
+    Attributes:
+        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n`.
+    """
 
     column = "applied_force_n"
 
 
 class HeightFile(_File):
-    """A motion from column `height_m`, a cubic spline between samples, still outside them."""
+    """A motion from column `height_m`, a cubic spline between samples, still outside them.
+
+    Attributes:
+        path: CSV file in the configuration's folder, with `t_s` and `height_m`.
+    """
 
     column = "height_m"
 
