@@ -27,7 +27,7 @@ from rig.formats.mapping import TableMapping
 from rig.guide.site import Block
 from rig.observers import OBSERVERS
 from rig.plan.config import OneOf, RunConfig
-from rig.simulated_bench.effects import EFFECT_KINDS
+from rig.simulated_bench.effects import EFFECT_KINDS, EffectParameter
 from rig.simulated_bench.schema import BenchConfig
 
 Array = NDArray[np.float64]
@@ -117,10 +117,15 @@ def _observer_keys() -> str:
 
 def _bench_effects() -> str:
     rows = [
-        (f"`{name}`", kind.words, ", ".join(f"`{it.name}`" for it in kind.parameters))
+        (f"`{name}`", kind.words, ", ".join(map(_bench_parameter, kind.parameters)))
         for name, kind in EFFECT_KINDS.items()
     ]
-    return _table(("Effect", "Meaning", "Parameters"), rows)
+    return _table(("Effect", "Meaning", "Parameters (default)"), rows)
+
+
+def _bench_parameter(item: EffectParameter) -> str:
+    default = "" if item.default is None else f" ({item.default:g})"
+    return f"`{item.name}`{default}"
 
 
 def _measured_quantities() -> str:
