@@ -95,7 +95,7 @@ class BodySpec(_Frozen):
         joint: Joint between the body and its parent.
         inertia_kg_m2: Principal moments of inertia about the centre of mass, which is the origin of
             the body's frame. If absent, each moment has the numerical value of the mass (10 kg:
-            10 kg·m²): state them for every body that rotates.
+            10 kg·m²), which is arbitrary: state the moments of every body that rotates.
     """
 
     name: Name
@@ -191,8 +191,8 @@ class FmuSpec(_Frozen):
     Attributes:
         file: The FMU, in the model file's folder.
         height: Variable of the strut's height in m: an input or a state.
-        velocity: Variable of the rate of the height in m/s, positive in rebound: an input or a
-            state.
+        velocity: Variable of the time derivative of the height in m/s, positive in rebound: an
+            input or a state.
         force: Variable of the strut's force in N, positive when it pushes the ends apart.
         acceleration: Instead of `force`, if the FMU models the whole bench: variable of the second
             derivative of the height in m/s². Exactly one of the two is required.

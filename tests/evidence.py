@@ -69,5 +69,5 @@ def _origin() -> str:
     return (
         f"on {today}, rig {version_of('rig')} (commit {commit or 'unknown'}), Python "
         f"{'.'.join(map(str, sys.version_info[:3]))}, {packages}, {platform.system()} on "
-        f"{os.cpu_count()} cores, load average {os.getloadavg()[2]:.1f} over a quarter of an hour."
+        f"{os.cpu_count()} cores, 15-minute load average {os.getloadavg()[2]:.1f}."
     )

@@ -48,11 +48,11 @@ TEXT = """
 Bridge and simulated bench run in one process, on a virtual bus, in real time: one frame in and one
 frame out per tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
 
-The lateness is the time from a tick's deadline to the wake-up of the loop; the work is the time
-from there to the end of the tick. A missed tick is counted and not made up for. The force error is
-the RMS difference to the simulated bench's load cell, relative to the peak force. The lateness
-depends on the machine as much as on the program: it differs on another machine. No CAN hardware
-took part.
+The lateness is the time from a tick's deadline to the wake-up of the loop; the work (computing
+time) is the time from the wake-up to the end of the tick. A missed tick is counted and not made up
+for. The force error is the RMS difference between the estimated force and that of the simulated
+bench's load cell, relative to the peak force. The lateness depends on the machine as much as on the
+program: it differs on another machine. No CAN hardware took part.
 """
 
 _ROUND_NS = 20_000_000

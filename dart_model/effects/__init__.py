@@ -51,9 +51,9 @@ CATALOGUE: Mapping[str, Effect] = MappingProxyType(
 FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
     {
         "preload": "a preload",
-        "stiffness": "another stiffness",
-        "damping": "another damping",
-        "inertia": "another inertia",
+        "stiffness": "a different stiffness",
+        "damping": "a different damping",
+        "inertia": "a different inertia",
         "input_gain": "a wrong gain of the applied force",
         "nonlinear_stiffness": "a non-linear spring",
         "stop": "an end stop",
@@ -65,7 +65,7 @@ FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
         "delay": "a delay between the channels",
         "periodic_force": "a periodic force",
         "unmodelled_mode": "a further mass on a spring",
-        "restoring_surface": "a force over height and velocity without a name",
+        "restoring_surface": "a restoring-force surface",
     }
 )
 """Every family of effects as a phrase with its article."""

@@ -56,7 +56,7 @@ _BOUNDS = within(centre_height_m=_CENTRES, gap_m=_gaps)
 BACKLASH = Effect(
     name="backlash",
     family="backlash",
-    words="free play (backlash)",
+    words="a further spring with free play, in parallel with the strut (dead zone)",
     parameters=(
         Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness beyond the free play"),
         _GAP,
@@ -74,7 +74,7 @@ BACKLASH = Effect(
 FREE_PLAY = Effect(
     name="free_play",
     family="backlash",
-    words="free play of the strut's spring, while its damper still acts",
+    words="free play of the strut's spring, in which the damper still acts",
     parameters=(_CENTRE, _GAP),
     force=_free_play,
     excitation=_BOTH,

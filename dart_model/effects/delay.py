@@ -51,7 +51,10 @@ DELAY = Effect(
         Parameter("delay_s", "s", 0.0, 1e3, "time by which the height lags the applied force"),
     ),
     force=_pade_less_one,
-    excitation="an applied force with frequencies near the inverse of the delay, or changing often",
+    excitation=(
+        "an applied force with frequencies high enough that the delay is a clear part of a period, "
+        "or with frequent steps"
+    ),
     reference="Golub and Van Loan, Matrix Computations (2013), 9.3, Padé approximation",
     rate=_pade_rates,
     scaled=(),

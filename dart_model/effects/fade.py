@@ -7,9 +7,19 @@ from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import Starts, grid, moving, within
 
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
-_FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that remains")
-_LOSS = Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin")
-_COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
+_FINAL = Parameter(
+    "final_fraction", "", 0.0, 3.0, "share of the damping that finally remains (above 1: it grows)"
+)
+_LOSS = Parameter(
+    "fraction_per_k",
+    "1/K",
+    -0.2,
+    0.2,
+    "relative loss of damping per kelvin, at the reference temperature",
+)
+_COLD = Parameter(
+    "reference_c", "°C", -273.15, 2000.0, "temperature at which the damping is that of the model"
+)
 AMBIENT_C = 20.0
 """Damper temperature where none is measured: that of a bench hall, and the reference of ISO 1."""
 
@@ -143,10 +153,10 @@ TIME_FADE = _fade(
     words="fade of the damper with time",
     parameters=(
         _FINAL,
-        Parameter("time_constant_s", "s", 1e-9, 1e12, "time constant with which the damping falls"),
+        Parameter("time_constant_s", "s", 1e-9, 1e12, "time constant of the fade"),
     ),
     force=_time,
-    excitation="a long run with the same motion at its beginning and end",
+    excitation="a long duration, with the same motion at the beginning and at the end",
     starts=_time_starts,
     bounds=within(time_constant_s=lambda m: (0.01 * m.duration_s, 10.0 * m.duration_s)),
     shown=("final_fraction",),
@@ -157,10 +167,16 @@ ENERGY_FADE = _fade(
     words="fade of the damper with dissipated energy",
     parameters=(
         _FINAL,
-        Parameter("energy_j", "J", 1e-12, 1e12, "dissipated energy with which the damping falls"),
+        Parameter(
+            "energy_j",
+            "J",
+            1e-12,
+            1e12,
+            "dissipated energy after which 63 % of the fade has taken place",
+        ),
     ),
     force=_energy,
-    excitation="a long run with the same motion at its beginning and end",
+    excitation="a long duration, with the same motion at the beginning and at the end",
     rate=_energy_rate,
     states=(State("work_j", 1.0),),
     starts=_energy_starts,

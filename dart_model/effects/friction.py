@@ -10,9 +10,9 @@ from functools import partial
 from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import crossing_time_s, grid, moving, of_speed, of_stroke, within
 
-_SLIDING = "motion that changes direction, and slow passages"
+_SLIDING = "motion that reverses, with slow phases"
 _COULOMB = Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction")
-_STATIC = Parameter("static_to_coulomb", "", 1.0, 5.0, "break-away over sliding friction")
+_STATIC = Parameter("static_to_coulomb", "", 1.0, 5.0, "ratio of break-away to sliding friction")
 _STRIBECK = Parameter(
     "stribeck_velocity_m_per_s",
     "m/s",
@@ -27,7 +27,9 @@ _ROUNDING = Parameter(
     1e6,
     "velocity scale over which the change of sign is rounded",
 )
-_PRESLIDING = Parameter("presliding_m", "m", 1e-12, 1e4, "deflection at which sliding begins")
+_PRESLIDING = Parameter(
+    "presliding_m", "m", 1e-12, 1e4, "deflection at which the bristle carries the sliding friction"
+)
 
 # A bristle settles at |velocity| / presliding, without bound; what is faster than this rate (1/s)
 # is over before it can be seen, and would only need shorter steps.

@@ -9,7 +9,9 @@ from dart_model.effects.ranges import geometric, grid, moving, of_least_stroke, 
 _LOOPS = "loops of different amplitude and frequency"
 # A loop that turned the other way would make energy out of nothing.
 _LIMIT = Parameter("yield_force_n", "N", 0.0, 1e12, "largest force of the loop")
-_BEND = Parameter("yield_displacement_m", "m", 1e-12, 1e4, "travel from rest to full force")
+_BEND = Parameter(
+    "yield_displacement_m", "m", 1e-12, 1e4, "ratio of the yield force to the initial stiffness"
+)
 
 ELEMENTS = 8
 """Slip elements of the Iwan model."""
@@ -211,17 +213,17 @@ DAHL = _hysteresis(
 
 GENERAL_BOUC_WEN = _hysteresis(
     name="general_bouc_wen",
-    words="hysteresis (Bouc-Wen, general: it may harden)",
+    words="hysteresis (generalised Bouc-Wen, with hardening or softening loops)",
     parameters=(
         Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness at the start of a loop"),
-        Parameter("bend_m", "m", 1e-12, 1e4, "travel over which the loop yields"),
+        Parameter("bend_m", "m", 1e-12, 1e4, "deflection scale of the yielding"),
         Parameter("exponent", "", 0.5, 5.0, "sharpness of the transition to the largest force"),
         Parameter(
             "angle_rad",
             "rad",
             -1.5707963,
             1.5707963,
-            "ratio of the two shape terms as an angle; below -pi/4 the loop hardens",
+            "arctangent of gamma over beta, the two shape factors; below -pi/4 the loop hardens",
         ),
     ),
     force=_spring,
@@ -240,7 +242,7 @@ FRICTION_BEHIND_PLAY = _hysteresis(
     parameters=(
         Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction"),
         Parameter("gap_m", "m", 1e-12, 1e4, "width of the play"),
-        Parameter("travel_m", "m", 1e-12, 1e4, "elastic travel to full force"),
+        Parameter("travel_m", "m", 1e-12, 1e4, "elastic deflection at full force"),
         Parameter("exponent", "", 0.3, 4.0, "sharpness of the transition to the largest force"),
     ),
     force=_behind_play,
@@ -279,10 +281,12 @@ MAXWELL = _hysteresis(
             1e12,
             "stiffness of the spring that is in series with a damper",
         ),
-        Parameter("relaxation_time_s", "s", 1e-6, 1e9, "damping of this damper over the stiffness"),
+        Parameter(
+            "relaxation_time_s", "s", 1e-6, 1e9, "ratio of this damper's damping to the stiffness"
+        ),
     ),
     force=_spring,
-    excitation="frequencies above and below the inverse of the relaxation time",
+    excitation="frequencies above and below 1/(2π × relaxation time)",
     reference="Flügge, Viscoelasticity (1975), 1.2",
     rate=_maxwell_rate,
     states=(State("spring_deflection_m", 0.01),),

@@ -10,8 +10,16 @@ def _gain_force(applied_force_n: float, gain: float) -> float:
 INPUT_GAIN = Effect(
     name="input_gain",
     family="input_gain",
-    words="the right gain of the applied force",
-    parameters=(Parameter("gain", "", -0.99, 10.0, "share of the applied force that is missing"),),
+    words="a correction of the gain of the applied force",
+    parameters=(
+        Parameter(
+            "gain",
+            "",
+            -0.99,
+            10.0,
+            "relative correction: the force that acts is (1 + gain) times the recorded one",
+        ),
+    ),
     force=_gain_force,
     excitation="an applied force of several frequencies or levels",
     reference="Ljung, System Identification (1999), 14.1",

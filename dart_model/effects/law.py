@@ -132,7 +132,8 @@ class Effect:
         words: The effect as a phrase with its article, the law in brackets.
         parameters: Parameters in the order in which arrays of values hold them.
         force: The law.
-        excitation: What a recording must contain for the effect to be seen.
+        excitation: What a recording must contain for the effect to be seen; it continues the phrase
+            "a run with".
         rate: Derivative of the internal state, or None for a law without one.
         states: Internal states in the order of `rate`.
         fits_state: Whether the state at the beginning of a recording is fitted: states that fade

@@ -19,7 +19,7 @@ _FRICTION = "coulomb_friction"
 """What a damper with a knee is where the motion is hardly ever as slow as that."""
 _SPEEDS = "velocities that differ by a factor of three or more, in both directions"
 _PLACES = "the same velocities at different heights"
-_DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
+_DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping at low velocity")
 _KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
 _LOST_DAMPING = Parameter(
     "lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "reduction of the damping beyond the knee"
@@ -290,7 +290,7 @@ SMOOTH_BLOW_OFF_DAMPING = _damper(
 
 STROKE_DAMPING = _damper(
     name="stroke_damping",
-    words="a non-linear damper (linear in the stroke)",
+    words="a non-linear damper (damping proportional to the deflection)",
     parameters=(
         Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per metre of deflection"),
     ),
@@ -303,7 +303,7 @@ STROKE_DAMPING = _damper(
 
 POSITION_DEPENDENT_DAMPING = _damper(
     name="position_dependent_damping",
-    words="a non-linear damper (quadratic in the stroke)",
+    words="a non-linear damper (damping proportional to the squared deflection)",
     parameters=(
         Parameter("damping_n_s_per_m3", "N·s/m³", -1e18, 1e18, "damping per squared deflection"),
     ),
@@ -317,9 +317,9 @@ POSITION_DEPENDENT_DAMPING = _damper(
 
 ZONE_DAMPING = _damper(
     name="zone_damping",
-    words="a non-linear damper (a zone of its stroke)",
+    words="a non-linear damper (in a zone of the travel)",
     parameters=(
-        _DAMPING,
+        Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping in the middle of the zone"),
         Parameter("centre_height_m", "m", -1e4, 1e4, "middle of the zone"),
         Parameter(
             "width_m",
@@ -344,7 +344,9 @@ END_ZONE_DAMPING = _damper(
         Parameter(
             "damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per metre of depth in the zone"
         ),
-        Parameter("zone_height_m", "m", -1e4, 1e4, "height below which the zone begins"),
+        Parameter(
+            "zone_height_m", "m", -1e4, 1e4, "height at which the zone begins; it extends downwards"
+        ),
     ),
     force=_end_zone,
     excitation=_PLACES,

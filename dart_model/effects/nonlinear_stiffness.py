@@ -9,7 +9,9 @@ from dart_model.effects.ranges import always, grid, height, moving, of_stroke, w
 _WIDE = "deflections from the free length that differ by a factor of three or more"
 _LARGEST_EXPONENT = 40.0
 _GAS = (
-    Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
+    Parameter(
+        "gas_length_m", "m", 1e-12, 1e4, "ratio of gas volume to piston area, at the free length"
+    ),
     Parameter("polytropic_exponent", "", 1.0, 3.0, "1: isothermal, 1.4: adiabatic (air)"),
 )
 
@@ -126,6 +128,7 @@ CENTRED_CUBIC_STIFFNESS = _spring(
         Parameter("centre_height_m", "m", -1e4, 1e4, "height at which the force is zero"),
     ),
     force=_centred_cubic,
+    excitation="deflections from the centre that differ by a factor of three or more",
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
     starts=moving(lambda m: grid([1.0], m.heights_m(0.1, 0.3, 0.5, 0.7, 0.9))),
     bounds=within(centre_height_m=height(-1.0, 2.0)),
@@ -153,7 +156,13 @@ PROGRESSIVE_STIFFNESS = _spring(
     words="a non-linear spring (progressive)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
-        Parameter("length_m", "m", 1e-12, 1e4, "deflection from which the spring stiffens clearly"),
+        Parameter(
+            "length_m",
+            "m",
+            1e-12,
+            1e4,
+            "deflection scale: below it the force is nearly cubic, well above it exponential",
+        ),
     ),
     force=_progressive,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
@@ -166,11 +175,15 @@ PROGRESSIVE_STIFFNESS = _spring(
 
 EXPONENTIAL_STIFFNESS = _spring(
     name="exponential_stiffness",
-    words="a non-linear spring (exponential, as rubber)",
+    words="a non-linear spring (exponential, like rubber)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
         Parameter(
-            "length_m", "m", 1e-12, 1e4, "compression over which the force grows by a factor of e"
+            "length_m",
+            "m",
+            1e-12,
+            1e4,
+            "compression over which the stiffness grows by a factor of e",
         ),
     ),
     force=_exponential,

@@ -28,7 +28,7 @@ PERIODIC_FORCE = Effect(
         Parameter("phase_rad", "rad", -100.0, 100.0, "phase of the sine at time zero"),
     ),
     force=_sine,
-    excitation="many of its periods, at another frequency than the applied force",
+    excitation="many periods of this force, and an applied force without its frequency",
     reference="Rao, Mechanical Vibrations (2017), 3.7, rotating unbalance",
     starts=_starts,
     bounds=within(frequency_hz=lambda m: (_LEAST_PERIODS / m.duration_s, 0.5 / m.step_s)),

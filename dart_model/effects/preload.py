@@ -12,10 +12,12 @@ PRELOAD = Effect(
     family="preload",
     words="a constant preload",
     parameters=(
-        Parameter("force_n", "N", -1e12, 1e12, "constant force that pushes the bodies apart"),
+        Parameter(
+            "force_n", "N", -1e12, 1e12, "constant force, positive when it pushes the bodies apart"
+        ),
     ),
     force=_constant,
-    excitation="any run whose mean height is measured",
+    excitation="a height whose zero is known",
     reference="Dixon, The Shock Absorber Handbook (2007), gas preload",
     linear=True,
     shown=("force_n",),

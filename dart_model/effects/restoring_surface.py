@@ -1,4 +1,4 @@
-"""A table of force over height and velocity, for what has no name."""
+"""A restoring-force surface: a table of the force over height and velocity, where no law fits."""
 
 from dart_model.effects.law import Effect, Floats, Parameter
 
@@ -41,7 +41,7 @@ def _surface(
 RESTORING_SURFACE = Effect(
     name="restoring_surface",
     family="restoring_surface",
-    words="a force over height and velocity without a name",
+    words="a restoring-force surface (a table of the force over height and velocity)",
     parameters=(
         Parameter("lowest_height_m", "m", -1e4, 1e4, "height of the first row"),
         Parameter("highest_height_m", "m", -1e4, 1e4, "height of the last row"),
@@ -61,7 +61,7 @@ RESTORING_SURFACE = Effect(
         ),
     ),
     force=_surface,
-    excitation="all combinations of height and velocity that matter",
+    excitation="all combinations of height and velocity that occur in use",
     reference="Masri and Caughey, J. Appl. Mech. 46 (1979), restoring force surface",
     scaled=tuple(range(FIRST_FORCE, FIRST_FORCE + HEIGHTS * VELOCITIES)),
 )

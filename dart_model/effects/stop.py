@@ -288,7 +288,7 @@ HERTZ_REBOUND_STOP = _stop(
 
 POWER_BUMP_STOP = _stop(
     name="power_bump_stop",
-    words="a bump stop (power law, as rubber)",
+    words="a bump stop (power law, like rubber)",
     parameters=_POWER,
     force=_power_bump,
     excitation=_BUMP,
@@ -301,7 +301,7 @@ POWER_BUMP_STOP = _stop(
 
 POWER_REBOUND_STOP = _stop(
     name="power_rebound_stop",
-    words="a rebound stop (power law, as rubber)",
+    words="a rebound stop (power law, like rubber)",
     parameters=_POWER,
     force=_power_rebound,
     excitation=_REBOUND,

@@ -58,10 +58,10 @@ HIDDEN_MASS = Effect(
     parameters=(
         Parameter("mass_kg", "kg", 1e-12, 1e9, "mass on the spring"),
         Parameter("frequency_hz", "Hz", 1e-9, 1e9, "natural frequency of the mass on its spring"),
-        Parameter("damping_ratio", "", 0.0, 2.0, "damping over critical damping"),
+        Parameter("damping_ratio", "", 0.0, 2.0, "ratio of the damping to the critical damping"),
     ),
     force=_hidden_mass,
-    excitation="frequencies around the mass's own resonance",
+    excitation="frequencies around the natural frequency of the mass on its spring",
     reference="Den Hartog, Mechanical Vibrations (1956), 3.2, dynamic absorber",
     rate=_hidden_mass_rate,
     states=(State("deflection_m", 0.01), State("mass_velocity_m_per_s", 0.01)),

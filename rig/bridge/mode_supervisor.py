@@ -114,7 +114,7 @@ class Supervision(BaseModel):
             an estimate is valid. By default the time after which the error that a step of the
             residual force causes in the closed loop has decayed to a hundredth of the step; for
             `kalman` the filter's variance decides.
-        overload_share: Share of missed ticks, of the last few hundred, from which the estimate is
+        overload_share: Share of missed ticks among the last few hundred from which the estimate is
             invalid (HOLD).
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
             has to arm the bridge first, after each start and each safe state.
@@ -128,8 +128,8 @@ class Supervision(BaseModel):
         log_fault: Reaction to a log that cannot be written: `continue`, or `safe` for the safe
             state.
         safe_output: Force that is published in the safe state: `zero`, or the `last` valid one.
-        limits: Table of limits. For a value without a row, the range of its signal in the DBC
-            applies to measured values, model height and published force.
+        limits: Table of limits. For a measured height, an applied force, a further sensor, a model
+            height or a published force without a row, the range of its signal in the DBC applies.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

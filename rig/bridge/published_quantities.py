@@ -81,7 +81,7 @@ KINEMATICS = (
         Dimension.VELOCITY,
         "velocity_m_per_s",
         "MODEL_VELOCITY",
-        "rate of the model's height, positive in rebound",
+        "time derivative of the model's height, positive in rebound",
     ),
     _of_strut(
         "acceleration",
@@ -175,7 +175,8 @@ STATUS = (
     ),
     _status(
         "first_cause",
-        f"why the estimate was last lost: {_CAUSES}; 0 while it is valid, or before the first loss",
+        f"cause of the last loss of the estimate: {_CAUSES}; 0 while the estimate is valid, or "
+        "before the first loss",
         lambda report: report.output.first_cause,
     ),
     _status(
@@ -218,7 +219,7 @@ def _timing(key: str, meaning: str, value: Callable[[TimingFigures], float]) -> 
     )
 
 
-_LATENESS, _WORK = "lateness of a tick", "duration of a tick's work"
+_LATENESS, _WORK = "lateness of a tick", "computing time of a tick"
 
 TIMING = (
     _timing("lateness_p50", f"{_LATENESS}, median", lambda it: it.lateness_s[0]),

@@ -74,18 +74,18 @@ class Limit(BaseModel):
             same). Of another measured signal (`channel`): `measured`, `measured_rate_per_s` or
             `unchanged_s`. Of the estimate: `height_m`, `force_n`, `virtual_force_n` or
             `innovation_m`. Of an estimate that has settled: `force_std_n` (its standard deviation),
-            `force_rate_n_per_s` (its change since the last tick) or `force_difference_n` (estimated
-            force less that of the load cell).
-        low: Smallest permitted value.
+            `force_rate_n_per_s` (its change since the last tick, per second) or
+            `force_difference_n` (estimated force less that of the load cell).
+        low: Smallest permitted value; a limit has `low`, `high` or both.
         high: Largest permitted value.
         for_s: Time for which a value of the estimate has to be beyond the limit until the action
             begins.
-        clear_s: Time for which it has to be within the limit until the action ends; by default
-            `for_s`, and at least 1 s for `force_difference_n`, because a wrong force that
-            oscillates crosses the right one.
-        action: `warn` reports the value in the status; `refuse` also drops the measurement; `hold`
-            makes the estimate invalid while the value is beyond the limit; `safe` enters the safe
-            state.
+        clear_s: Time for which a value of the estimate has to be within the limit until the action
+            ends; by default `for_s`, and at least 1 s for `force_difference_n`, because a wrong
+            force that oscillates crosses the right one.
+        action: `warn` reports the value in the status. `refuse` also refuses the frame of a
+            measurement. `hold` makes the estimate invalid while the value is beyond the limit;
+            `safe` enters the safe state. For a measurement, these two refuse its frame, too.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

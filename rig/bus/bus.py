@@ -79,7 +79,7 @@ class BusConfig:
     Attributes:
         interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
         channel: Channel of the interface.
-        bitrate: Bit rate in bit/s.
+        bitrate: Bit rate in bit/s; with `socketcan` that of the interface, which `ip link` sets.
         data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
         options: Further arguments of python-can's interface.
     """

@@ -69,9 +69,11 @@ class AuthenticationSettings(BaseModel):
         freshness_bits: Bits of the freshness value in a frame.
         mac_bits: Bits of the CMAC in a frame.
         clock_tolerance_s: Largest difference between the clocks of bench and bridge at the start.
-            Even a bridge that has just been started refuses a frame that was recorded longer ago.
-        max_age_s: Largest age of a frame by the bridge's own clock, or lead over it, during the
-            run, which allows for clocks that drift apart; at least the tolerance.
+            Even a bridge that has just been started refuses a frame that was recorded longer ago
+            than this.
+        max_age_s: Largest age of a frame during the run by the bridge's clock, and its largest lead
+            over this clock; larger than the tolerance to allow for clocks that drift apart. A value
+            below `clock_tolerance_s` counts as `clock_tolerance_s`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

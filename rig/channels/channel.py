@@ -50,7 +50,8 @@ class Zero(BaseModel):
     """A reading of a position sensor at a known length of the strut; `rig zero` measures it.
 
     Attributes:
-        reads: Reading of the sensor in m, after the scaling of the DBC or of a mapping.
+        reads: Reading of the sensor in m, after its scaling: by the DBC, or by a mapping's gain and
+            unit.
         at_m: Length of the strut at that reading, in m.
     """
 
@@ -67,7 +68,7 @@ class MeasuredSignal(SignalName):
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
         valid: Signal of the same message that shows whether the sensor measures; a frame in which
-            it has another value is refused. If absent, every value is used.
+            this signal does not have `valid.value` is refused. If absent, every value is used.
         counter: Signal of the same message that rises by one with every frame, for a message
             without E2E protection. It shows frames that are lost, repeated or out of sequence, and
             with the cycle time the times of the samples.
@@ -75,9 +76,10 @@ class MeasuredSignal(SignalName):
             end of its range.
         zero: For a height: a reading at a known length of the strut. Without it the reading is the
             length.
-        reversed: True if the reading falls while the quantity grows; for a height with a zero, a
-            velocity or a force.
-        tare_n: For a force: the reading without a force in N, after the same scaling; 0 if absent.
+        reversed: True if the reading falls while the quantity grows; only for a height with a zero,
+            a velocity or a force.
+        tare_n: For a force: the reading without a force, in N after the scaling by the DBC, and
+            before a reversal; 0 if absent.
     """
 
     valid: ValidSignal | None = None

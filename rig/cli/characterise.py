@@ -38,7 +38,7 @@ Tolerance = Annotated[
 Master = Annotated[
     Path | None,
     typer.Option(
-        metavar="RUN", help="Record of a good damper in the same test, to name what is wrong."
+        metavar="RUN", help="Record of a good damper in the same test, to name the fault of RUN."
     ),
 ]
 Scatter = Annotated[

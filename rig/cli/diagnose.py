@@ -21,7 +21,10 @@ def diagnose(
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write into.")],
     held_out: Annotated[
-        list[Path] | None, typer.Option(metavar="RUN", help="Held-out run; may be repeated.")
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN", help="Run that takes no part in the search and the fit; may be repeated."
+        ),
     ] = None,
     pdf: Annotated[
         bool,

@@ -51,7 +51,7 @@ def export_command(
         bool,
         typer.Option(
             "--bench",
-            help="With --fmu: export the whole bench, of one guided degree of freedom.",
+            help="With --fmu: export the whole bench; it must have one guided degree of freedom.",
         ),
     ] = False,
     as_json: JsonFlag = False,

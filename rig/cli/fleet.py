@@ -193,7 +193,8 @@ def query_command(
     """Query a store in SQL (DuckDB): one SELECT statement, which opens no other file.
 
     `runs` has one row per run, `effects` one row per parameter of the model (kind `model`) or of an
-    effect that it lacks (`found`); `values` also has the figures of `rig characterise` (`figure`).
+    effect that the model lacks (`found`); `values` also has the figures of `rig characterise`
+    (`figure`).
     """
     from rig.fleet.store import query
 

@@ -76,7 +76,8 @@ def import_command(
     A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, an MTS file at least --rebound. A bus
     log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export` wrote as MF4 or
     Parquet requires neither; one that it wrote as CSV need not be imported. With --fmu, SOURCE is a
-    functional mock-up unit: a program, which is then permitted to run on this machine.
+    functional mock-up unit (FMU). An FMU is a program; the command permits it to run on this
+    machine.
     """
     if fmu:
         if config is not None or rebound is not None:

@@ -73,7 +73,10 @@ Stiffness = Annotated[
 Damping = Annotated[
     float | None,
     typer.Option(
-        metavar="N.S/M", min=0.0, max=1e8, help="Damping; a damping ratio of 0.2 if absent."
+        metavar="N.S/M",
+        min=0.0,
+        max=1e8,
+        help="Damping; if absent, that of a damping ratio of 0.2.",
     ),
 ]
 Run = Annotated[

@@ -144,6 +144,6 @@ def _print_timing_picture(ended: "Ended") -> None:
     from rig.pages.timing_picture import draw_run
 
     try:
-        print_text(f"Histograms of lateness and work: {draw_run(ended)}")
+        print_text(f"Histograms of lateness and computing time: {draw_run(ended)}")
     except OSError as error:  # such as a full disk; the run is over and its log is whole
         console.print(f"No histograms: {error.strerror}", style="yellow")

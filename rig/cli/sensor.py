@@ -90,7 +90,7 @@ def scan_command(
 ) -> None:
     """Find the CANopen and J1939 sensors on a bus, and write a DBC and a configuration.
 
-    The device type is requested from every CANopen node id, the process data from each device, and
+    The device type is requested from every CANopen node id, the PDO mapping from each device, and
     address claims from J1939 devices; nothing is changed. On a bus with other devices, for which
     these requests may have another meaning, use --listen-only.
     """

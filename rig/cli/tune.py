@@ -58,8 +58,8 @@ NoiseStd = Annotated[
         metavar="M",
         min=1e-12,
         max=1.0,
-        help="Without a run: standard deviation of the height's noise; by default that of the "
-        "signal's resolution in the DBC.",
+        help="Without a run: standard deviation of the height's noise; by default that of its "
+        "quantisation, by the signal's resolution in the DBC.",
     ),
 ]
 GainMargin = Annotated[
@@ -68,8 +68,8 @@ GainMargin = Annotated[
         metavar="FACTOR",
         min=1.0,
         max=20.0,
-        help="Factor by which the model may respond more, or less, and stay stable; 1.1 for "
-        "kalman and 2 for pi by default.",
+        help="Gain margin: factor by which the response of the bench may be larger, or smaller, "
+        "than the model's while the loop stays stable; 1.1 for kalman and 2 for pi by default.",
     ),
 ]
 
@@ -110,7 +110,9 @@ def tune_command(
     settling_s: SettlingTime = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the configuration, in the folder of CONFIG."),
+        typer.Option(
+            metavar="FILE", help="New file for the tuned configuration, in the folder of CONFIG."
+        ),
     ] = None,
     plot: Annotated[
         Path | None,

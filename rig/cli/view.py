@@ -26,16 +26,16 @@ Port = Annotated[
         metavar="PORT",
         min=0,
         max=65535,
-        help=f"Port on this machine; 0 takes a free one. {_PORT} by default, Foxglove's is "
-        f"{_FOXGLOVE_PORT}.",
+        help=f"Port on this machine; 0 takes a free one. {_PORT} by default, "
+        f"{_FOXGLOVE_PORT} with --foxglove.",
     ),
 ]
 ControlFlag = Annotated[
     bool,
     typer.Option(
         "--control",
-        help="Let the page change gains and limits of a live run, and start a diagnosis of a "
-        "finished one; open the address it prints.",
+        help="Let the page change gains and limits of a run in progress, acknowledge and arm, and "
+        "start a diagnosis of a finished run; open the address that is printed.",
     ),
 ]
 FoxgloveFlag = Annotated[

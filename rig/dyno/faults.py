@@ -359,10 +359,10 @@ def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
     by_play = _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays))
     least_n = -master.friction_n
     return [
-        Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas, most=1.0),
-        Fault("seal friction", "more by", "N", more_n, more_n[:, None] * against, least=least_n),
-        Fault("air in the oil", "the oil gives by", "mm/kN", gives, by_air, least=0.0),
-        Fault("play", "of", "mm", 1e3 * plays, by_play, least=0.0),
+        Fault("gas pressure", "relative loss", "", lost, -lost[:, None] * gas, most=1.0),
+        Fault("seal friction", "increase", "N", more_n, more_n[:, None] * against, least=least_n),
+        Fault("air in the oil", "compliance of the oil", "mm/kN", gives, by_air, least=0.0),
+        Fault("play", "width", "mm", 1e3 * plays, by_play, least=0.0),
         *[_early_opening(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
         *[_other_damping(master, strokes, sides) for sides in _SIDES],
     ]
@@ -389,19 +389,19 @@ def _early_opening(master: Master, strokes: Sequence[MeanStroke], sides: Sequenc
         side = "compression" if stroke.sign < 0 else "rebound"
         less = _opening_loss(getattr(master, side), np.abs(_velocity(stroke)), shares)
         rows.append(-stroke.sign * less * (side in sides))
-    name = f"blow-off early in {' and '.join(sides)}"
+    name = f"early blow-off in {' and '.join(sides)}"
     changes = np.concatenate(rows, axis=1)
-    quantity = "speed of opening lower by the share"
+    quantity = "relative reduction of the opening speed"
     return Fault(name, quantity, "", shares, changes, least=0.0, most=1.0)
 
 
 def _other_damping(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
-    """Another damping at all speeds alike: a valve or an oil of another kind."""
+    """Damping changed by one factor at all speeds: a different valve or oil."""
     shares = np.concatenate([np.linspace(-1.0, 1.0, 41), [2.0, 4.0]])
     rows = [sum(_property_forces(stroke, master)[side] for side in sides) for stroke in strokes]
-    name = f"another damping in {' and '.join(sides)}"
+    name = f"changed damping in {' and '.join(sides)}"
     changes = shares[:, None] * np.concatenate(rows)
-    return Fault(name, "at all speeds more by the share", "", shares, changes, least=-1.0)
+    return Fault(name, "relative change at all speeds", "", shares, changes, least=-1.0)
 
 
 def _compliances(master: Master) -> Array:

@@ -28,7 +28,7 @@ class TextLayout(_Section):
     """Layout of a text table.
 
     Attributes:
-        separator: One character, ``tab``, or ``whitespace`` for any number of blanks.
+        separator: One character, ``tab``, or ``whitespace`` for any run of spaces and tabs.
         decimal: Decimal sign: a point or a comma.
         encoding: Character encoding, by its name in Python.
         skip_lines: Lines before the column names, or before the data where there are no names.
@@ -88,8 +88,9 @@ class _Channel(_Section):
     Attributes:
         column: Column of the quantity, by its name or its number (from 1).
         unit: Unit of the product of gain and reading, such as ``mm``, ``kN``, ``lbf``.
-        gain: Factor on the reading, in `unit` per unit of the table, such as 500 for a sensor with
-            500 N/V whose volts were recorded.
+        gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
+            sensitivity of the sensor, such as 20 for a height sensor with 20 mm/V, or 500 for a
+            load cell with 500 N/V.
     """
 
     column: ColumnName
@@ -136,7 +137,8 @@ class ForceChannel(_Channel):
     """A force.
 
     Attributes:
-        tare_n: Reading without a force, in N after the gain.
+        tare_n: Reading without a force, in N after the gain and the conversion of the unit, and
+            before a reversal.
         reversed: True if the table has the opposite sign.
     """
 
@@ -153,7 +155,7 @@ class TemperatureChannel(_Channel):
     """A temperature; `offset_k` is added.
 
     Attributes:
-        offset_k: Offset that is added to the reading, in K.
+        offset_k: Offset in K that is added after the gain and the conversion of the unit.
     """
 
     offset_k: Finite = 0.0
@@ -169,10 +171,13 @@ class TableMapping(_Section):
 
     Attributes:
         table: Layout of a text table; not used for MF4 files.
-        time: Times of the rows; not used for MF4 files, whose channels have times.
+        time: Times of the rows; required for a text table, not used for MF4 files, whose channels
+            have times.
         height: Height of the strut, which grows in rebound.
-        applied_force: Force on the body, positive upwards (force-driven bench).
-        strut_force: Force of the load cell, positive when the strut pushes its ends apart.
+        applied_force: Force on the body, positive upwards (force-driven bench); this or
+            `strut_force` is required.
+        strut_force: Force of the load cell, positive when the strut pushes its ends apart; this or
+            `applied_force` is required.
         temperature: Temperature of the damper.
     """
 

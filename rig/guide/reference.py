@@ -27,7 +27,7 @@ from rig.formats.mapping import TableMapping
 from rig.guide.site import Block
 from rig.observers import OBSERVERS
 from rig.plan.config import OneOf, RunConfig
-from rig.simulated_bench.effects import EFFECT_KINDS
+from rig.simulated_bench.effects import EFFECT_KINDS, EffectParameter
 from rig.simulated_bench.schema import BenchConfig
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ _MOTION = Motion(
 
 
 _MOST_PARAMETERS = 12
-"""Rows of an effect's table: the table of forces has hundreds of parameters alike."""
+"""Rows of an effect's table: the table of forces has dozens of parameters alike."""
 
 
 def generated_blocks(
@@ -117,10 +117,15 @@ def _observer_keys() -> str:
 
 def _bench_effects() -> str:
     rows = [
-        (f"`{name}`", kind.words, ", ".join(f"`{it.name}`" for it in kind.parameters))
+        (f"`{name}`", kind.words, ", ".join(map(_bench_parameter, kind.parameters)))
         for name, kind in EFFECT_KINDS.items()
     ]
-    return _table(("Effect", "Meaning", "Parameters"), rows)
+    return _table(("Effect", "Meaning", "Parameters (default)"), rows)
+
+
+def _bench_parameter(item: EffectParameter) -> str:
+    default = "" if item.default is None else f" ({item.default:g})"
+    return f"`{item.name}`{default}"
 
 
 def _measured_quantities() -> str:
@@ -191,7 +196,9 @@ def _effect(item: Effect, pictures: Path | None) -> str:
     ]
     if item.rate:
         parts.append(
-            "Rate of its internal states:\n\n```python\n" + _formula("rate", item.rate) + "\n```"
+            "Time derivatives of its internal states:\n\n```python\n"
+            + _formula("rate", item.rate)
+            + "\n```"
         )
     if pictures is not None and _draw(item, pictures / f"{item.name}.svg"):
         parts.append(
@@ -266,21 +273,51 @@ def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str
         meaning = meanings.get(name, "")
         if sections:
             first = (inspect.getdoc(sections[0]) or "").partition("\n")[0]
-            yield f"{prefix}{name}", "", meaning or first
-            rows = [row for section in sections for row in _rows(section, f"{prefix}{name}.")]
-            yield from _merged(rows)
+            yield f"{prefix}{name}", _section_default(default), meaning or first
+            yield from _alternatives(sections, f"{prefix}{name}.")
         else:
             text = "required" if default is PydanticUndefined else _default_text(default)
             yield f"{prefix}{name}", text, meaning
 
 
-def _merged(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
-    """One row for each key of alternative sections, with each of its meanings."""
-    by_key: dict[str, list[tuple[str, str, str]]] = {}
-    for row in rows:
-        by_key.setdefault(row[0], []).append(row)
+def _section_default(default: object) -> str:
+    """Text of a section's default; empty if its keys have defaults of their own."""
+    if default is PydanticUndefined:
+        return "required"
+    return "none" if default is None or default in ((), {}) else ""
+
+
+def _alternatives(sections: Sequence[type[object]], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """One row for each key of alternative sections, with each of its meanings.
+
+    A key that only some of them have is followed by the choice that these are; without such a
+    choice, it is not required.
+    """
+    by_key: dict[str, list[tuple[str, str]]] = {}
+    having: dict[str, list[type[object]]] = {}
+    for section in sections:
+        for key, default, meaning in _rows(section, prefix):
+            by_key.setdefault(key, []).append((default, meaning))
+            having.setdefault(key, []).append(section)
     for key, same in by_key.items():
-        yield key, same[0][1], " ".join(dict.fromkeys(meaning for _, _, meaning in same))
+        default, meaning = same[0][0], " ".join(dict.fromkeys(text for _, text in same))
+        if len(same) < len(sections) and "." not in key.removeprefix(prefix):
+            choice = _choice(having[key])
+            meaning += choice and f" Only with {choice}."
+            default = "" if default == "required" and not choice else default
+        yield key, default, meaning
+
+
+def _choice(sections: Sequence[type[object]]) -> str:
+    """Keys with the only value that each section permits, such as `kind: sine`; empty if none."""
+    values = [
+        f"`{name}: {typing.get_args(field.annotation)[0]}`"
+        for section in sections
+        for name, field in cast("Mapping[str, FieldInfo]", getattr(section, _FIELDS)).items()
+        if typing.get_origin(field.annotation) is typing.Literal
+        and len(typing.get_args(field.annotation)) == 1
+    ]
+    return " or ".join(values)
 
 
 def _default_text(default: object) -> str:

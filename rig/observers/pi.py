@@ -91,9 +91,11 @@ class PiObserver:
         kind: `pi`: the PI observer (default).
         proportional_n_per_m: Proportional gain K_P.
         integral_n_per_m_s: Integral gain K_I.
-        derivative_n_s_per_m: Derivative gain, on the rate of the innovation; requires `filter`.
+        derivative_n_s_per_m: Derivative gain, on the time derivative of the innovation; requires
+            `filter`.
         force_limit_n: Largest magnitude of the virtual force.
-        filter: Filter that predicts the present innovation; if absent, the last one is used.
+        filter: Filter that predicts the present innovation; if absent, `pi` uses the last
+            innovation.
     """
 
     requires_height: ClassVar[bool] = True

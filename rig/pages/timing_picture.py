@@ -1,4 +1,4 @@
-"""Lateness and work of a run's ticks as a picture."""
+"""Lateness and computing time of a run's ticks as a picture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class Distribution:
 
 
 def draw_run(ended: Ended) -> Path:
-    """Draw lateness and work of a run's ticks into its folder; returns the file.
+    """Draw lateness and computing time of a run's ticks into its folder; returns the file.
 
     Raises:
         OSError: It cannot be written.

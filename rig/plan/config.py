@@ -138,8 +138,7 @@ def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
         valid: Signal of the same message that shows whether the sensor measures.
         delay_s: Time from the measurement to the arrival of its frame.
         measures: Measured quantity of the strut: {choices}.
-        {noise.key}: Standard deviation of a reading, quantisation included, for a sensor that
-            measures a {quantity.key}.
+        {noise.key}: Standard deviation of a reading, quantisation included.
     """
     return settings
 

@@ -33,15 +33,18 @@ _LEAST_IN_PHASE = 4
 class LossCause(Enum):
     """Cause of lost time, as far as the kernel accounts for it."""
 
-    QUOTA = "the host's CPU quota: gaps end in phase with periods of 100 ms"
-    HOST = "the host ran something else: as much time was stolen in the run"
-    OTHER_THREAD = "the loop could run, and another thread had the core"
+    QUOTA = "the host's CPU quota (gaps end in phase with its period of 100 ms)"
+    HOST = (
+        "the host ran something else (the run's steal time is at least half of what is otherwise "
+        "not accounted for)"
+    )
+    OTHER_THREAD = "the loop was ready to run, but another thread had the core"
     INTERPRETER = "the log's thread held the interpreter"
     DISK = "a page was read from a disk"
     FAULTS = "pages were mapped"
     KERNEL = "the kernel took the core"
     OWN = "the loop's own work"
-    UNACCOUNTED = "not accounted for: an interrupt, or a host that pauses the machine"
+    UNACCOUNTED = "not accounted for (an interrupt, or a host that pauses the machine)"
 
 
 class LateTick(NamedTuple):
@@ -49,8 +52,8 @@ class LateTick(NamedTuple):
 
     Attributes:
         missed: Their number.
-        part: Where the time went: receive, compute, send, log, between (what the loop does before
-            it waits) or wait.
+        part: Where the time went: receive, compute, send, log, between (what the loop does after
+            the log, before it waits) or wait.
         excess_ns: How much longer the part took than usual.
         end_ns: When the loop resumed.
     """

@@ -125,18 +125,18 @@ _PARAMETERS: dict[LawCode, tuple[EffectParameter, ...]] = {
 _WORDS: dict[LawCode, str] = {
     LawCode.PRELOAD: "constant force",
     LawCode.LINEAR_STIFFNESS: "linear spring",
-    LawCode.QUADRATIC_STIFFNESS: "force with the square of the deflection",
-    LawCode.CUBIC_STIFFNESS: "force with the cube of the deflection",
+    LawCode.QUADRATIC_STIFFNESS: "force proportional to the square of the deflection",
+    LawCode.CUBIC_STIFFNESS: "force proportional to the cube of the deflection",
     LawCode.PROGRESSIVE_STIFFNESS: "spring that stiffens exponentially",
     LawCode.GAS_SPRING: "polytropic gas spring",
     LawCode.BUMP_STOP: "stop in compression (Hunt-Crossley)",
     LawCode.REBOUND_STOP: "stop in rebound (Hunt-Crossley)",
-    LawCode.BACKLASH: "free play within a spring",
+    LawCode.BACKLASH: "further spring with free play (dead zone)",
     LawCode.LINEAR_DAMPING: "linear damper",
-    LawCode.QUADRATIC_DAMPING: "force with the square of the velocity",
+    LawCode.QUADRATIC_DAMPING: "force proportional to the square of the velocity",
     LawCode.ASYMMETRIC_DAMPING: "linear damper, different in compression and rebound",
     LawCode.DIGRESSIVE_DAMPING: "damper with a knee",
-    LawCode.POSITION_DEPENDENT_DAMPING: "damping that rises with the square of the deflection",
+    LawCode.POSITION_DEPENDENT_DAMPING: "damping proportional to the square of the deflection",
     LawCode.FRICTION: "dry friction (LuGre)",
     LawCode.BOUC_WEN: "hysteresis (Bouc-Wen)",
     LawCode.MAXWELL: "spring and damper in series",
@@ -145,7 +145,7 @@ _WORDS: dict[LawCode, str] = {
     LawCode.TIME_FADE: "fade of the damper with time",
     LawCode.HIDDEN_MASS: "further mass on a spring and a damper",
     LawCode.ADDED_MASS: "further mass on the upper body",
-    LawCode.INPUT_GAIN: "factor on the applied force",
+    LawCode.INPUT_GAIN: "factor on the applied force (1 changes nothing)",
     LawCode.DELAY: "delay of the applied force",
 }
 _STATES = {LawCode.FRICTION: 1, LawCode.BOUC_WEN: 1, LawCode.MAXWELL: 1, LawCode.HIDDEN_MASS: 2}
@@ -178,7 +178,7 @@ def parameter_error(name: str, given: dict[str, float]) -> str | None:
             return f"{key} = {value:g}, expected a value {low}{high}"
     for parameter in parameters.values():
         if parameter.default is None and parameter.name not in given:
-            return f"{parameter.name} is missing, {name} needs it"
+            return f"{parameter.name} is missing, {name} requires it"
     return None
 
 

@@ -80,8 +80,8 @@ class DamperCurve(_Curve):
     """Damper force over velocity, by points; monotone cubic between, straight beyond.
 
     Attributes:
-        velocity_m_per_s: Rates of height, increasing, in m/s.
-        force_n: Force at each rate in N, positive when the damper pushes its bodies apart.
+        velocity_m_per_s: Time derivatives of the height (rebound is positive), increasing, in m/s.
+        force_n: Force at each velocity in N, positive when the damper pushes its bodies apart.
     """
 
     velocity_m_per_s: Points
@@ -245,8 +245,7 @@ class _File(_Section):
 
     Attributes:
         kind: `file`: a column of a CSV file.
-        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n` or
-            `height_m`.
+        path: CSV file in the configuration's folder.
     """
 
     column: ClassVar[str]
@@ -267,13 +266,21 @@ class _File(_Section):
 
 
 class ForceFile(_File):
-    """A force from column `applied_force_n`, straight between samples, zero outside them."""
+    """A force from column `applied_force_n`, straight between samples, zero outside them.
+
+    Attributes:
+        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n`.
+    """
 
     column = "applied_force_n"
 
 
 class HeightFile(_File):
-    """A motion from column `height_m`, a cubic spline between samples, still outside them."""
+    """A motion from column `height_m`, a cubic spline between samples, still outside them.
+
+    Attributes:
+        path: CSV file in the configuration's folder, with `t_s` and `height_m`.
+    """
 
     column = "height_m"
 
@@ -339,9 +346,9 @@ class UndeclaredEffect(_Section):
     """An effect of the bench that no model declares.
 
     Attributes:
-        name: Name of the effect, from the list of effects.
+        name: Name of the effect, from the table of effects.
         strut: Strut in which the effect acts, or whose upper body it changes.
-        parameters: Values of the effect's parameters, by name.
+        parameters: Values of the effect's parameters, by name; those with a default may be absent.
     """
 
     name: str
@@ -384,7 +391,8 @@ class HeightSensor(_Sensor):
 
     Attributes:
         strut: Strut whose height it measures.
-        offset_m: Reading at a height of zero, in m, as of a draw-wire with an arbitrary zero.
+        offset_m: Reading at a height of zero, in m, such as that of a draw-wire sensor with an
+            arbitrary zero.
         noise_std_m: Standard deviation of white noise in m.
     """
 
@@ -436,7 +444,8 @@ class Transmission(_Section):
         message: Message of the DBC.
         period_ns: Time between samples in ns; the cycle time in the DBC if absent.
         latency_ns: Time from sample to transmission in ns.
-        jitter_ns: Largest additional delay in ns, uniformly distributed from zero.
+        jitter_ns: Largest additional delay in ns; the delay is uniformly distributed from zero to
+            this value.
         loss_probability: Probability that a frame is lost; the counter shows the gap.
         height: Height sensor, if the message carries one.
         applied_force: Sensor of the applied force, if the message carries one.
@@ -475,7 +484,7 @@ class BenchConfig(_Section):
         name: Name of the bench.
         gravity_m_per_s2: Gravitational acceleration.
         masses: Bodies.
-        struts: Struts, each of which carries one body; its lower end is the world or another body.
+        struts: Struts. Each carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any.
         prescribed_motion: The motion that drives a strut, if any.
         temperature: Temperature of the damper.

@@ -31,9 +31,9 @@ rounds of all rows of a table alternate. Each ratio is formed within one round; 
 median over the rounds, with the 10th and 90th percentile in parentheses. It therefore differs from
 the ratio of the two medians.
 
-- *DART, scalar functions* and *DART, array functions*: bare DART loops with a moving body, which
-  read position and velocity, set a force and call `World.step`, with DART's cheaper scalar
-  functions or its array functions.
+- *DART, scalar functions* and *DART, array functions*: bare DART loops with one moving body. They
+  read position and velocity, set a force and call `World.step`. Reading and setting use DART's
+  scalar functions, which are cheaper, or its array functions.
 - *Plant alone*: DART with the bridge's third-order integrator.
 - *Plant, observer and supervisor*: the same with a PI observer and the supervision of the mode,
   without frames.
@@ -83,12 +83,13 @@ def describe_logs(folder: Path) -> str:
     cantools_us, frame_us, log_us = time_decoding()
     replay_us, by_hand_us = time_replays(folder)
     return (
-        f"Decoding a log of {FRAMES} frames at once is {cantools_us / log_us:.0f} times as fast as "
-        "decoding it frame by frame with cantools; decoding a single frame is "
-        f"{cantools_us / frame_us:.1f} times as fast (fastest of {REPEATS} repeats). A replay that "
-        f"reproduces the log of a run bit for bit computes {1e6 / replay_us:.0f} ticks per second "
-        f"on one core; one of its ticks takes {replay_us / by_hand_us:.1f} times as long as one of "
-        "the hand-written loop (fastest of five rounds)."
+        f"rig decodes a log of {FRAMES} frames in one call {cantools_us / log_us:.0f} times as "
+        "fast as cantools decodes it frame by frame, and a single frame "
+        f"{cantools_us / frame_us:.1f} times as fast (two signals per frame; CPU time, fastest of "
+        f"{REPEATS} repeats). A replay computes about {round(1e6 / replay_us, -2):.0f} ticks per "
+        "second on one core, and reproduces the log bit for bit; its tick takes "
+        f"{replay_us / by_hand_us:.1f} times as long as that of the hand-written loop (fastest of "
+        "five rounds)."
     )
 
 
@@ -103,8 +104,8 @@ def main() -> None:
             "The bare DART loops with a PI observer added, and nothing else:",
             compare(time_rounds(observer_subjects())),
             "Whole ticks with four struts of a full car, compared with one strut. The model is "
-            "replaced by one that computes nothing, so that these times are smaller than those "
-            "above:",
+            "replaced by one that computes nothing: the times are those of the bridge alone, and "
+            "are not comparable with those above:",
             compare_struts(Path(folder)),
             describe_logs(Path(folder)),
         ]

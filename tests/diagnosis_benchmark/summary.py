@@ -44,8 +44,8 @@ table contains the groups that were run.
 
 A case counts as right if
 
-- `rig diagnose` names the planted families as missing (if one effect is planted, in the first
-  place),
+- `rig diagnose` names the planted families as missing (if only one effect is planted: names it
+  first),
 - or a partial or ambiguous result contains them,
 - or nothing is planted, and at most linear corrections of a rough model are named,
 - or no law describes the planted force, and the result claims neither that laws explain it nor that
@@ -53,10 +53,11 @@ A case counts as right if
 
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
-*False names* is the share of cases in which an effect is named that was not planted, *not bound*
-the share in which the data do not exclude that a named effect has the size zero. Shares are given
-with their 95 % interval after Wilson. A group that ends with `complete` has no planted effect; one
-that begins with `rough` has a rough nominal model. The rows in italics combine several groups.
+*False names* is the share of cases in which an effect is named that was not planted; *not bound* is
+the share of cases in which the data do not exclude that a named effect has the size zero. Shares
+are given with their 95 % interval after Wilson. A group that ends with `complete` has no planted
+effect; one that begins with `rough` has a rough nominal model. The rows in italics combine several
+groups.
 """
 
 

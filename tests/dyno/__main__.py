@@ -10,17 +10,17 @@ from tests.dyno.dynos import drawn, found
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
-{cases} records of dampers in sine tests are drawn at random, with one of the laws {laws}, and with
-white noise. `rig characterise` computes the figures of each record with 95 % intervals; the true
-values are known. The table gives the share of the intervals that contain the true value, over all
-laws and for each law. In parentheses it gives the median half width of the interval, relative to
-the value, unless the value is zero. Correlated noise and the errors of a real sensor are not part
-of this study.
+{cases} records of dampers in sine tests are simulated with random parameters. Each damper has one
+of the laws {laws}; each record has white noise. `rig characterise` computes the figures of each
+record with 95 % intervals; the true values are known. The table gives the share of the intervals
+that contain the true value, over all laws and for each law. In parentheses it gives the median half
+width of the interval, relative to the true value, unless that is zero. Correlated noise and the
+errors of a real sensor are not part of this study.
 
 *Window* is the mean force in a window about mid-stroke, *peak* the largest force, *energy* that of
 a cycle. *Mean force* and *half difference* are half the sum and half the difference of the forces
-in compression and in rebound at mid-stroke; *hysteresis at zero* is their difference at the turning
-points.
+in compression and in rebound at mid-stroke; *hysteresis at zero* is the force in compression less
+that in rebound at the turning points.
 """
 
 

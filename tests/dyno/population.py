@@ -63,8 +63,8 @@ FAULTS = {
     "seal friction": lambda d, rng: replace(d, friction_n=d.friction_n + rng.uniform(15.0, 80.0)),
     "air in the oil": lambda d, rng: replace(d, give_m_per_n=rng.uniform(0.2e-6, 1.0e-6)),
     "play": lambda d, rng: replace(d, play_m=rng.uniform(0.2e-3, 1.0e-3)),
-    "another damping": lambda d, rng: weaker(d, rng.uniform(0.2, 0.5), int(rng.integers(3))),
-    "blow-off early": lambda d, rng: early(d, rng.uniform(0.25, 0.6), int(rng.integers(3))),
+    "changed damping": lambda d, rng: weaker(d, rng.uniform(0.2, 0.5), int(rng.integers(3))),
+    "early blow-off": lambda d, rng: early(d, rng.uniform(0.25, 0.6), int(rng.integers(3))),
 }
 
 
@@ -193,15 +193,16 @@ def one(job):
 
 TEXT = """
 `rig characterise --master` compares a damper with a good one in the same test, and names its fault.
-Here the dampers are simulated with their own equations: a polytropic gas column, a damping law with
-a sharp knee, oil whose stiffness rises with pressure, and free play as a contact.
+Here the dampers are simulated with equations other than those of the evaluation: a polytropic gas
+column, a damping law with a sharp knee and, for the faults of that name, aerated oil whose
+stiffness rises with pressure, and free play as a contact.
 
-Gas force, friction, damping below and above the knee, and the speed of the knee scatter by
-{scatter:g} % (standard deviation) from damper to damper, in each direction; the master has no
-scatter. Half of the dampers are good. Each of the others has one fault of a random size. Other
-faults than those in the table were not tested. The last column counts, of the dampers
-that were named correctly, those whose 95 % interval contains the true size of the fault; it is
-empty where the reported size has no counterpart in the simulation.
+Gas force and friction, and, independently in rebound and compression, the damping below and above
+the knee and the speed of the knee scatter by {scatter:g} % (standard deviation) from damper to
+damper; the master is the nominal damper. Half of the dampers are good. Each of the others has one
+fault of a random size. No faults other than those in the table were tested. The last column covers
+only the dampers that were named correctly: it counts those whose 95 % interval contains the true
+size of the fault. It is empty where the reported size has no counterpart in the simulation.
 """
 
 PLANTED = {
@@ -210,8 +211,8 @@ PLANTED = {
     "seal friction": "seal friction, an increase of 15 to 80 N",
     "air in the oil": "air in the oil, 0.2 to 1 mm/kN at low pressure",
     "play": "play, 0.2 to 1 mm",
-    "another damping": "damping, a loss of 20 to 50 % at all speeds, in one direction or both",
-    "blow-off early": "blow-off at a speed 25 to 60 % lower, in one direction or both",
+    "changed damping": "damping, a loss of 20 to 50 % at all speeds, in one direction or both",
+    "early blow-off": "blow-off at a speed 25 to 60 % lower, in one direction or both",
 }
 """What `FAULTS` draws."""
 
@@ -250,7 +251,7 @@ def true_sizes(fault, damper) -> list[float]:
         return [damper.friction_n - good.friction_n]
     if fault == "play":
         return [1e3 * damper.play_m]
-    if fault == "blow-off early":
+    if fault == "early blow-off":
         shares = [1.0 - damper.opens / good.opens, 1.0 - damper.opens_up / good.opens_up]
         return [share for share in shares if share > 0.2]
     return []
@@ -286,7 +287,7 @@ def row_of(fault: str, counts: Counter[str]) -> tuple[object, ...]:
 
 def write_page(found: Mapping[str, Counter[str]]) -> None:
     """Write the guide's page."""
-    heads = ("fault", "dampers", "named correctly", "otherwise", "interval contains the size")
+    heads = ("fault", "dampers", "named correctly", "named otherwise", "interval contains the size")
     write_evidence(
         "dyno-faults",
         "How often a damper's fault is named correctly",

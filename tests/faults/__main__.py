@@ -35,7 +35,8 @@ the largest error of the settled run.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
   published gains / a damped PI observer / the noise-aware observer.
 - In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the
-  operating system, with a bus in a separate network; only `VALID` is decoded.
+  operating system, with a virtual bus in a separate network namespace;
+  only `VALID` is decoded.
 - The last column states what the bench itself has to do.
 """
 

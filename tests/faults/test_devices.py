@@ -126,7 +126,7 @@ def test_an_emergency(row):
         "reported the end of the error, the estimate settles and is valid again; the safe state if "
         "the error lasts longer than 0.5 s",
         found_ms,
-        "the frames of this time",
+        "the frames during this time",
     )
 
 
@@ -138,7 +138,8 @@ def test_a_lost_heartbeat(row):
     assert found_ms == pytest.approx(151, abs=1)
     row(
         32,
-        "a CANopen device sends no heartbeat any more (`heartbeat_s: 0.25`), but its measurements",
+        "a CANopen device stops sending its heartbeat (`heartbeat_s: 0.25`), but continues to send "
+        "measurements",
         "as after an emergency",
         "250 ms after the last heartbeat",
         "the frames from then on",
@@ -179,7 +180,7 @@ def test_an_alarm_in_the_measurement_itself(row):
         "alarm of a device in the measurement's own frame (`alarms`)",
         "refuses this frame; then as after an emergency",
         first_ms(ticks, lambda tick: tick.mode is Mode.HOLD),
-        "the frames of this time",
+        "the frames during this time",
     )
 
 

@@ -128,7 +128,7 @@ def test_delay(row, undisturbed_n):
     assert error_n < 5.0 * undisturbed_n
     row(
         4,
-        "delay: from a moment on, all frames arrive 3 ms later, stamped on arrival",
+        "delay: from one instant on, all frames arrive 3 ms later, stamped on arrival",
         f"refuses {refused} frames that contradict their sender's clock, and the estimate settles "
         "again; then the delay is attributed to the sender: force error "
         f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (state it with `delay_s`)",

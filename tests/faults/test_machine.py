@@ -129,7 +129,7 @@ def test_bus_off(row):
         f"BUS_FAULT, estimate invalid after {hold_ms:.0f} ms (HOLD); the controller's restart is "
         f"detected; the estimate is valid again when it has settled, {back_ms - 200:.0f} ms later",
         first_ms(ticks, lambda tick: tick.counts.bus_faulty > 0),
-        "the frames of this time",
+        "the frames during this time",
     )
 
 
@@ -154,7 +154,7 @@ def test_link_down(row):
         f"... ms, then once a second (here opened {late_ms:.0f} ms after it was up); the gap is "
         "recorded in `run.yaml`",
         first_ms(ticks, lambda tick: tick.counts.bus_faulty > 0),
-        "the frames of this time",
+        "the frames during this time",
     )
 
 
@@ -348,7 +348,7 @@ def test_sigterm(row, tmp_path):
     row(
         18,
         "SIGTERM",
-        "ends in order: the log is closed, `run.yaml` states the end",
+        "ends properly: the log is closed, `run.yaml` states the end",
         "one tick",
         "nothing",
     )

@@ -197,7 +197,7 @@ class Reader(HTMLParser):
             [
                 "linear stiffness, stiffness −117 N/m",
                 "not identifiable from these data",
-                "or else another damping or another inertia",
+                "or else a different damping or a different inertia",
                 "do not distinguish them (to distinguish them: a run with two sines)",
                 "2.31 mm to 10.4 µm",
             ],

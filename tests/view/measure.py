@@ -27,15 +27,16 @@ TEXT = """
 Headless Chromium opens the page that `rig view` serves, and draws it in software; a browser that
 draws with a graphics processor uses less CPU time. No artificial load runs on the cores.
 
-For the time to open the page, a run of one hour is generated: synthetic steps at 1 kHz, in files
-such as a live run leaves. The time runs from the request of the page until the whole run is drawn.
+For the time to open the page, a run of one hour is generated: synthetic steps at 1 kHz, in the same
+files as those of a live run. The time runs from the request of the page until the whole run is
+drawn.
 
 For the effect on a run, live runs of {seconds} s at 1 kHz (bridge and simulated bench in one
 process, on a virtual bus) alternate between no page and one open page. Missed ticks and lateness
 are compared within each pair.
 
-The memory of the server is its anonymous resident memory (RssAnon), that of the page the JavaScript
-heap after a garbage collection.
+The memory of the server is its anonymous resident memory (RssAnon); the memory of the page is the
+JavaScript heap after a garbage collection.
 """
 ADDRESS = re.compile(r"http://\S+")
 
