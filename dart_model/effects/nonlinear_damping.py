@@ -230,10 +230,10 @@ DIRECTIONAL_DAMPING = _damper(
 
 DIGRESSIVE_DAMPING = _damper(
     name="digressive_damping",
-    words="a non-linear damper (digressive)",
+    words="a non-linear damper (digressive, towards a constant force)",
     parameters=(_DAMPING, _KNEE),
     force=_digressive,
-    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
     simpler=("linear_damping", _FRICTION),
@@ -245,7 +245,7 @@ SATURATING_DAMPING = _damper(
     words="a non-linear damper (saturating)",
     parameters=(_DAMPING, _KNEE, Parameter("sharpness", "", 0.5, 12.0, "sharpness of the knee")),
     force=_saturating,
-    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3",
     starts=_saturating_starts,
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
     simpler=("linear_damping", _FRICTION, "digressive_damping"),
@@ -266,7 +266,7 @@ ARCTAN_DAMPING = _damper(
 
 BLOW_OFF_DAMPING = _damper(
     name="blow_off_damping",
-    words="a non-linear damper (blow-off valve)",
+    words="a non-linear damper (blow-off valve, smaller slope above a sharp knee)",
     parameters=(_LOST_DAMPING, _KNEE),
     force=_blow_off,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
@@ -278,7 +278,7 @@ BLOW_OFF_DAMPING = _damper(
 
 SMOOTH_BLOW_OFF_DAMPING = _damper(
     name="smooth_blow_off_damping",
-    words="a non-linear damper (blow-off valve, rounded knee)",
+    words="a non-linear damper (blow-off valve, smaller slope above a rounded knee)",
     parameters=(_LOST_DAMPING, _KNEE),
     force=_smooth_blow_off,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
