@@ -145,7 +145,7 @@ def find_height(database: Database, named: str | None) -> Choice:
             + (
                 f": if it is {' or '.join(unitless[:_MOST_OTHERS])}, give it its unit in the DBC"
                 if unitless
-                else ""
+                else ": is this the DBC of the bench? `rig sensor scan` finds sensors without one"
             )
         )
     if ranked[0].score < LIKELY:
