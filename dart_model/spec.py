@@ -69,7 +69,7 @@ class JointSpec(_Frozen):
 
     Attributes:
         type: ``prismatic``, ``revolute``, ``ball`` or ``free``.
-        axis: Direction of a prismatic or revolute joint; its length does not matter.
+        axis: Direction of a prismatic or revolute joint in the parent's frame, of any length.
         parent: Name of the parent body, or ``world``.
         offset_m: Origin of the joint in the parent's frame.
     """
@@ -285,8 +285,9 @@ class ModelSpec(_Frozen):
         gravity_m_per_s2: Gravitational acceleration, in the direction of -z.
         skeleton: Bodies and joints: either `bodies` or `file`.
         struts: Spring-dampers; one observer may act on each.
-        applied_force_body: Body on which the applied force acts; by default the upper body of the
-            last strut, or its lower body if the upper one is ``world``.
+        applied_force_body: Body at whose origin the applied force acts, in the direction of +z; by
+            default the upper body of the last strut, or its lower body if the upper one is
+            ``world``.
         tolerance: Prior standard deviation of the bench's parameters from the values in this file.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """

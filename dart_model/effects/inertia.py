@@ -1,4 +1,8 @@
-"""Inertia the model lacks: a mass with its weight, or an inerter, which has none."""
+"""Inertia the model lacks: a mass with its weight, or an inerter, which has none.
+
+The upper body alone carries both: an inerter between two moving bodies would also act on the lower
+one.
+"""
 
 from dart_model.effects.law import Effect, Parameter
 
@@ -30,10 +34,14 @@ ADDED_MASS = Effect(
 INERTER = Effect(
     name="inerter",
     family="inertia",
-    words="inertia between the bodies (an inerter)",
+    words="inertia without weight (an inerter)",
     parameters=(
         Parameter(
-            "inertance_kg", "kg", -1e9, 1e9, "force per relative acceleration; it has no weight"
+            "inertance_kg",
+            "kg",
+            -1e9,
+            1e9,
+            "inertia of the upper body without weight; an inerter if the lower end is fixed",
         ),
     ),
     force=_weight_compensation,

@@ -119,7 +119,7 @@ class Supervision(BaseModel):
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
             has to arm the bridge first, after each start and each safe state.
         fade_in_s: Time in which the published force fades in, from the safe output to the
-            estimate, before it is valid.
+            estimate, before the estimate is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
             output. Without `fade_in_s` and `slew_n_per_s`, the model's force is published in HOLD,
             and the safe output at once in SAFE.

@@ -62,7 +62,8 @@ class TimeColumn(_Section):
     Attributes:
         column: Column of the time, by its name or its number (from 1).
         unit: Unit of a column of numbers, such as ``s`` or ``ms``.
-        date_format: Format of a column of dates, as for C's ``strptime``, or ``iso`` for ISO 8601.
+        date_format: Format of a column of dates, as for C's ``strptime``, or ``iso`` for ISO 8601;
+            only for text tables.
         sampling_rate_hz: Rows per second, if the table has no column of times.
     """
 
@@ -170,9 +171,8 @@ class TableMapping(_Section):
     """The meaning of a foreign table.
 
     Attributes:
-        table: Layout of a text table; not used for MF4 files.
-        time: Times of the rows; required for a text table, not used for MF4 files, whose channels
-            have times.
+        table: Layout of a text table; not used for other files.
+        time: Times of the rows; required except for MF4 files, whose channels have times.
         height: Height of the strut, which grows in rebound.
         applied_force: Force on the body, positive upwards (force-driven bench); this or
             `strut_force` is required.

@@ -184,15 +184,16 @@ def _effect(item: Effect, pictures: Path | None) -> str:
     ]
     more = len(item.parameters) - _MOST_PARAMETERS
     names = ", ".join(f"`{name}`" for name in item.simpler)
-    simpler = f" A diagnosis names a simpler law instead if it fits as well: {names}."
+    simpler = f" A diagnosis names a simpler law instead if that law fits as well: {names}."
     simpler *= bool(item.simpler)
+    beyond = " in addition to the inertia of the body" if item.adds_mass else ""
     parts = [
         f"### {item.name}",
         f"{item.words[0].upper()}{item.words[1:]}.{simpler} Required excitation: "
         f"{item.excitation}.",
         _table(("Parameter", "Unit", "Bounds", "Meaning"), rows),
         *([f"Further parameters: {more}, of the same kind."] if more > 0 else []),
-        f"Force, N:\n\n```python\n{_formula('force_n', item.force)}\n```",
+        f"Force{beyond}, N:\n\n```python\n{_formula('force_n', item.force)}\n```",
     ]
     if item.rate:
         parts.append(

@@ -34,7 +34,8 @@ class Realtime(BaseModel):
         fifo_priority: Priority under SCHED_FIFO; 0 requests none.
         lock_memory: Lock all pages in memory.
         cpu: Core on which the loop runs; if absent, the scheduler chooses it.
-        spin_s: Time for which the loop spins before a deadline, if SCHED_FIFO was granted.
+        spin_s: Time for which the loop spins before a deadline, at most a fifth of the period; only
+            if SCHED_FIFO was granted.
         freeze_garbage: Collect garbage before the run and not during it.
     """
 

@@ -184,8 +184,8 @@ class ErrorFilter:
 
     Attributes:
         bandwidth_hz: Bandwidth within which the residual force is followed.
-        noise_std_m: Standard deviation of the height measurement, quantisation included (resolution
-            over the square root of 12).
+        noise_std_m: Standard deviation of the height measurement, quantisation included (that of
+            the quantisation alone is the resolution divided by the square root of 12).
     """
 
     bandwidth_hz: Annotated[Finite, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]

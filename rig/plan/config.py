@@ -246,8 +246,8 @@ class LogConfig(_Frozen):
     """How the log of a run is kept.
 
     Attributes:
-        rotate_bytes: Size from which the log continues in further files; if absent, it does not.
-        rotate_s: Time after which the log continues in further files; if absent, it does not.
+        rotate_bytes: Size from which the log continues in a further file; no limit if absent.
+        rotate_s: Time after which the log continues in a further file; no limit if absent.
         capture_before_s: Length of an excerpt before the fault.
         capture_after_s: Length of an excerpt after the fault.
         most_captures: Largest number of excerpts around faults in one run. An excerpt is kept at
@@ -290,7 +290,8 @@ class RunConfig(_Frozen):
         authentication: Authentication of all frames; none if absent.
         signals: Signals that are read from the bus.
         devices: Devices that report their state, by the names of their nodes in the DBC.
-        prescribed_motion: Declares a dyno, which has a load cell and no applied force.
+        prescribed_motion: Declares a dyno: the motion is prescribed, a load cell is required, and
+            an applied force is not permitted.
         observers: Observer of each strut, by strut name; `pi` for a strut without an entry. A dyno
             uses no observer. The keys of each kind are listed below.
         publish: Signals that carry the quantities of each strut, by strut name and by the keys of
