@@ -1,7 +1,7 @@
 """`rig bench`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +20,10 @@ from rig.cli.terminal import (
 )
 from rig.files.folders import refuse_full
 
+if TYPE_CHECKING:
+    from rig.bus.bus import BusConfig
+    from rig.bus.secoc import Authentication
+
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
     "`rig bench my_bench.yaml --bridge rig.yaml --out runs/bench` · without a bus: "
@@ -27,46 +31,56 @@ EXAMPLES = (
 )
 
 
+Dbc = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
+]
+Duration = Annotated[
+    float | None, typer.Option(metavar="S", min=0.001, help="Duration; until Ctrl-C by default.")
+]
+Bridge = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Take bus, DBC and authentication from a bridge's configuration instead.",
+    ),
+]
+Lockstep = Annotated[
+    bool,
+    typer.Option(
+        "--lockstep",
+        help="Run that bridge too, both in simulated time, as fast as the machine allows and "
+        "without a bus.",
+    ),
+]
+OtherModel = Annotated[
+    str | None,
+    typer.Option(metavar="MODEL", help="With --lockstep: another model than the bridge's."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR", help="Folder for summary.json; with --lockstep that of the bridge's run."
+    ),
+]
+
+
 def bench(
     config: ConfigFile,
     interface: Interface = "socketcan",
     channel: Channel = "vcan0",
     bitrate: Bitrate = 1_000_000,
-    dbc: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
-    ] = None,
-    duration_s: Annotated[
-        float | None,
-        typer.Option(metavar="S", min=0.001, help="Duration; until Ctrl-C by default."),
-    ] = None,
-    bridge: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Take bus, DBC and authentication from a bridge's configuration instead.",
-        ),
-    ] = None,
-    lockstep: Annotated[
-        bool,
-        typer.Option(
-            "--lockstep",
-            help="Run that bridge too, both in simulated time, as fast as the machine allows and "
-            "without a bus.",
-        ),
-    ] = False,
-    model: Annotated[
-        str | None,
-        typer.Option(metavar="MODEL", help="With --lockstep: another model than the bridge's."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder for summary.json; with --lockstep that of the bridge's run."
-        ),
-    ] = None,
+    dbc: Dbc = None,
+    duration_s: Duration = None,
+    bridge: Bridge = None,
+    lockstep: Lockstep = False,
+    model: OtherModel = None,
+    out: Out = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench on a bus, in real time, or together with its bridge."""
+    from rig.bus.bus import BusConfig
+    from rig.plan.load import load_plan
+
     if lockstep:
         if bridge is None or out is None:
             raise InputError("--lockstep: expected --bridge CONFIG and --out DIR with it")
@@ -74,18 +88,31 @@ def bench(
         return
     if model is not None:
         raise InputError("--model: expected --lockstep with it")
-    from rig.bus.bus import BusConfig
-    from rig.plan.load import load_plan
+    bus, authentication = BusConfig(interface, channel, bitrate), None
+    if bridge is not None:
+        plan = load_plan(bridge)
+        bus, dbc, authentication = plan.config.bus, plan.database.path, plan.authentication
+    summary = _run_alone(config, bus, dbc, authentication, duration_s)
+    if as_json:
+        print_json(summary)
+    else:
+        console.print(f"Sent {summary['frames']} frames.")
+    write_summary(out, summary)
+
+
+def _run_alone(
+    config: Path,
+    bus: "BusConfig",
+    dbc: Path | None,
+    authentication: "Authentication | None",
+    duration_s: float | None,
+) -> dict[str, object]:
+    """Run a bench on a bus, and count its frames."""
     from rig.run.live import run_bench
     from rig.run.loop import RunControl
     from rig.simulated_bench.config import load_bench_config
 
     bench_config = load_bench_config(config)
-    bus, authentication = BusConfig(interface, channel, bitrate), None
-    if bridge is not None:
-        plan = load_plan(bridge)
-        bus, dbc = plan.config.bus, plan.database.path
-        authentication = plan.authentication
     with stoppable() as stop, progress_line(duration_s) as progress:
         frames = run_bench(
             bench_config,
@@ -95,12 +122,7 @@ def bench(
             authentication=authentication,
             duration_s=duration_s,
         )
-    summary: dict[str, object] = {"bench": bench_config.name, "frames": frames}
-    if as_json:
-        print_json(summary)
-    else:
-        console.print(f"Sent {frames} frames.")
-    write_summary(out, summary)
+    return {"bench": bench_config.name, "frames": frames}
 
 
 def _run_with_bridge(

@@ -126,7 +126,8 @@ def print_run(ended: "Ended", *, with_timing: bool) -> None:
             rows.append((label, str(value)))
     if with_timing:
         timing = ended.timing
-        for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):
+        levels = timing.lateness_us(), timing.work_us()
+        for label, figures in zip(("lateness", "computing time"), levels, strict=True):
             text = " · ".join(f"{level} {value:.0f}" for level, value in figures.items())
             rows.append((f"{label} of a tick, µs", text))
         rows.append(("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}"))
