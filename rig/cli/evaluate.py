@@ -91,7 +91,7 @@ def _as_dict(
         "height_rmse_m": figures.height_rmse_m.after,
         "residual_force_rmse_n": figures.residual_force_rmse_n.after,
         "strut_force_rmse_n": None if cell is None else cell.after,
-        "applied_force_gaps": gaps[figures.run]._asdict() if figures.run in gaps else None,
+        "applied_force_gaps": gaps[figures.run].as_dict() if figures.run in gaps else None,
         "noise_floor": {
             "height_rmse_m": floor.height_rmse_m,
             "residual_force_rmse_n": floor.residual_force_rmse_n,

@@ -4,12 +4,16 @@ A free run's heights are DART's, with the applied force as the only input; only 
 which is not measured, is fitted. An observer with a high gain would hide any model error.
 """
 
+import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.least_squares import Effort
+from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem.build import Problems, build
 from rig.diagnosis.problem.problem import (
     CandidateModel,
@@ -19,10 +23,13 @@ from rig.diagnosis.problem.problem import (
     first_starts,
     nominal,
     nominal_model,
+    select_nodes,
 )
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import Fit, fit
 from rig.recordings.recording import Recording, RecordingError
+
+Array = NDArray[np.float64]
 
 
 def evaluate_model(spec: ModelSpec, recordings: Sequence[Recording]) -> tuple[RunEvaluation, ...]:
@@ -35,9 +42,7 @@ def evaluate_model(spec: ModelSpec, recordings: Sequence[Recording]) -> tuple[Ru
     given = fit_as_given(problem)
     models = ComparedModels(given.model, given.model, given.model)
     fitted_rms_n = problem.residual_force_rms_n(given.mean_square)
-    return tuple(
-        problem.evaluate(k, models, fitted_rms_n, blocks=False) for k in range(problem.recordings)
-    )
+    return _evaluate(problem, models, fitted_rms_n, blocks=False)
 
 
 def fit_as_given(problem: Problem) -> Fit:
@@ -69,10 +74,66 @@ def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[
         *(_fit_starts(problems, m) for m in (nominal, linear.model, corrected.model))
     )
     fitted_rms_n = problems.learnt.residual_force_rms_n(corrected.mean_square)
-    return tuple(
-        held_out.evaluate(k, models, fitted_rms_n, blocks=problems.by_blocks)
-        for k in range(held_out.recordings)
+    return _evaluate(held_out, models, fitted_rms_n, blocks=problems.by_blocks)
+
+
+def _evaluate(
+    problem: Problem, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
+) -> tuple[RunEvaluation, ...]:
+    """Figures of every recording, from those of its pieces."""
+    pieces: dict[int, list[tuple[int, RunEvaluation]]] = {}
+    for k, grid in enumerate(problem.grids):
+        nodes = int(np.sum(select_nodes(grid, blocks=blocks)))
+        if nodes:
+            figures = problem.evaluate(k, models, fitted_rms_n, blocks=blocks)
+            pieces.setdefault(grid.recording, []).append((nodes, figures))
+    return tuple(_join(*zip(*parts, strict=True)) for parts in pieces.values())
+
+
+def _join(nodes: Sequence[int], pieces: Sequence[RunEvaluation]) -> RunEvaluation:
+    """Figures of a recording: quadratic means over its pieces, by the number of their nodes."""
+    if len(pieces) == 1:
+        return pieces[0]
+
+    def mean(values: Sequence[float]) -> float:
+        return float(np.sqrt(np.average(np.square(values), weights=nodes)))
+
+    def both(pairs: Sequence[BeforeAfter]) -> BeforeAfter:
+        return BeforeAfter(mean([it.before for it in pairs]), mean([it.after for it in pairs]))
+
+    figures = [piece.figures for piece in pieces]
+    cells = [it.strut_force_rmse_n for it in figures if it.strut_force_rmse_n is not None]
+    return RunEvaluation(
+        RunFigures(
+            figures[0].run,
+            both([it.height_rmse_m for it in figures]),
+            both([it.residual_force_rmse_n for it in figures]),
+            both(cells) if len(cells) == len(figures) else None,
+        ),
+        both([piece.target for piece in pieces]),
+        mean([piece.linear for piece in pieces]),
+        mean([piece.linear_force_n for piece in pieces]),
+        NoiseFloor(
+            mean([piece.floor.height_rmse_m for piece in pieces]),
+            mean([piece.floor.residual_force_rmse_n for piece in pieces]),
+        ),
+        mean([piece.drift_m for piece in pieces]),
+        tuple(map(_join_series, zip(*(piece.series for piece in pieces), strict=True))),
     )
+
+
+def _join_series(pieces: Sequence[HeldOutSeries]) -> HeldOutSeries:
+    """The pieces of a series one after another, with a gap of NaN between two."""
+
+    def join(name: str) -> Array:
+        parts = [getattr(pieces[0], name)]
+        for last, piece in itertools.pairwise(pieces):
+            middle = 0.5 * (last.t_s[-1] + piece.t_s[0]) if name == "t_s" else np.nan
+            parts += [np.array([middle]), getattr(piece, name)]
+        return np.concatenate(parts)
+
+    columns = ("t_s", "measured", "before", "after", "height_m", "velocity_m_per_s")
+    return dataclasses.replace(pieces[0], **{name: join(name) for name in columns})
 
 
 def _fit_starts(problems: Problems, model: CandidateModel) -> CandidateModel:

@@ -123,7 +123,7 @@ def compose_result(
         ),
         _notes(problem, search, by_blocks=by_blocks)
         + _notes_of_friction_like_laws(problem, chosen, after),
-        tuple(grid.name for grid in problem.grids),
+        tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
     )
     models = search.given.model, chosen.model
@@ -372,7 +372,7 @@ def _collect_series(
 
 def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[str, ...]:
     notes = [problem.assumption]
-    if outliers := sum(grid.outliers for grid in problem.grids):
+    if outliers := sum({grid.recording: grid.outliers for grid in problem.grids}.values()):
         notes.append(f"{outliers} heights are outliers and were removed.")
     if search.gain_alike:
         notes.append(

@@ -47,7 +47,9 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         values.get("applied_force_n"),
         _stack_columns(cells, samples),
         values.get("temperature_c"),
-        find_gaps(values["t_s"]) if "applied_force_n" in values else None,
+        find_gaps(values["t_s"], values["applied_force_n"])
+        if "applied_force_n" in values
+        else None,
     )
 
 

@@ -26,7 +26,7 @@ class Recording:
         strut_forces_n: Load-cell force of each strut, shape (N, struts), a column of NaN for a
             strut without a cell; None where there is no cell.
         temperature_c: Damper temperature, shape (N,), or None.
-        force_gaps: Gaps over which the applied force is interpolated; None for none.
+        force_gaps: Gaps of the applied force, over which it is interpolated here; None for none.
         sha256: Of the file, or of the run's steps, in hex; None where it was not read from one.
     """
 

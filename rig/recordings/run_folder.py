@@ -19,8 +19,11 @@ from rig.log.checksums import refuse_damage
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_header
-from rig.recordings.gaps import find_gaps
+from rig.recordings.gaps import are_timed, find_gaps
 from rig.recordings.recording import Array, Recording, RecordingError
+
+_OFF_GRID = 0.4
+"""Cycles by which an arrival may be off the grid of its cycle time."""
 
 
 def read_run(folder: Path) -> Recording:
@@ -64,7 +67,7 @@ def read_run(folder: Path) -> Recording:
         applied_n,
         None if cell_n is None or len(heights) > 1 else cell_n[:, np.newaxis],
         _resample(payloads, temperature, t_s),
-        None if applied is None else find_gaps(_samples(payloads, applied)[0]),
+        None if applied is None else find_gaps(*_samples(payloads, applied)),
     )
 
 
@@ -126,7 +129,10 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
         good &= np.isfinite(stamps_s)
         times_s = _stamped_times_s(t_ns[good], stamps_s[good], channel)
     else:
-        times_s = _sample_times_s(t_ns[good], message)
+        times_s = _grid_times_s(t_ns[good], message.cycle_time_ns)
+    if times_s is None:
+        good[good] = are_timed(t_ns[good])
+        times_s = np.asarray(t_ns[good] * 1e-9, dtype=np.float64)
     t_s, first = np.unique(times_s, return_index=True)
     return t_s, values[good][first]
 
@@ -143,16 +149,15 @@ def _stamped_times_s(t_ns: NDArray[np.int64], stamps_s: Array, channel: Channel)
     return np.array(times_ns) * 1e-9
 
 
-def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:
-    """Times of sampling in s: on the grid of the cycle time where the arrivals fit one."""
-    cycle_ns = message.cycle_time_ns
+def _grid_times_s(t_ns: NDArray[np.int64], cycle_ns: int | None) -> Array | None:
+    """Times of sampling in s on the grid of the cycle time; None if the arrivals do not fit it."""
     if cycle_ns is None or len(t_ns) == 0:
-        return np.asarray(t_ns * 1e-9, dtype=np.float64)
+        return None
     index = np.rint((t_ns - t_ns[0]) / cycle_ns)
     jitter_ns = t_ns - t_ns[0] - index * cycle_ns
-    if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > 0.4 * cycle_ns:
-        return np.asarray(t_ns * 1e-9, dtype=np.float64)
-    return (t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9
+    if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > _OFF_GRID * cycle_ns:
+        return None
+    return np.asarray((t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9, dtype=np.float64)
 
 
 def _resample(payloads: _Payloads, channel: Channel | None, t_s: Array) -> Array | None:

@@ -11,10 +11,17 @@ from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.free_run import FreeRunProblem
-from rig.diagnosis.problem.grid import smooth_recording, strut_motions
+from rig.diagnosis.problem.grid import SmoothRecording, smooth_recording, strut_motions
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
-from rig.diagnosis.problem.problem import Problem, ProblemBasis, ResidualForces
+from rig.diagnosis.problem.problem import (
+    Problem,
+    ProblemBasis,
+    ResidualForces,
+    first_starts,
+    nominal,
+    nominal_model,
+)
 from rig.recordings.recording import Recording, RecordingError
 from rig.recordings.recording_checks import check_fits
 
@@ -54,8 +61,8 @@ def build_problems(
         return Problems(learnt, learnt, by_blocks=True)
     for recording in held_out:
         check_fits(recording, spec)
-    smooth = [smooth_recording(recording) for recording in held_out]
-    evaluated = type(learnt).of_recordings(learnt.basis, smooth)
+    smooth = _smooth(held_out)
+    evaluated = divided_at_gaps(type(learnt).of_recordings(learnt.basis, smooth), smooth)
     return Problems(learnt, evaluated, by_blocks=False)
 
 
@@ -73,7 +80,7 @@ def build(
     length = sum(recording.duration_s for recording in recordings)
     block_s = max(length / blocks, _LEAST_BLOCK_S)
     held_out = None if held_out_every is None else (block_s, held_out_every)
-    smooth = [smooth_recording(recording, held_out) for recording in recordings]
+    smooth = _smooth(recordings, held_out)
     plants = open_plants(spec)
     motions = strut_motions(spec, smooth)
     mechanism = mechanism_along(plants, smooth[0].motion)
@@ -82,7 +89,43 @@ def build(
     linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism)
     existing = track.existing_effects(spec, [recording.motion for recording in smooth])
     basis = ProblemBasis(spec, linear, existing, motions, block_s, plants)
-    return kind.of_recordings(basis, smooth)
+    return divided_at_gaps(kind.of_recordings(basis, smooth), smooth)
+
+
+def _smooth(
+    recordings: Sequence[Recording], held_out: tuple[float, int] | None = None
+) -> list[SmoothRecording]:
+    """Recordings on nodes and smoothed, each with its index."""
+    smooth = [smooth_recording(recording, held_out) for recording in recordings]
+    return [it._replace(grid=it.grid._replace(recording=k)) for k, it in enumerate(smooth)]
+
+
+def divided_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> Problem:
+    """The problem of the pieces between gaps of the applied force that are not interpolated.
+
+    Raises:
+        RecordingError: Less than half of a recording lies in pieces that are long enough.
+    """
+    pieces: list[tuple[int, slice]] = []
+    for k, (recording, grid, *_) in enumerate(recordings):
+        gaps = recording.force_gaps
+        between = grid.pieces_between(() if gaps is None else gaps.long_s)
+        left = sum(piece.stop - piece.start for piece in between) / len(grid.t_s)
+        if gaps is not None and left < _MOSTLY:
+            raise RecordingError(
+                f"{gaps.report(recording.name)} Only {left:.0%} of the run are left in pieces of "
+                "half a second or more, expected half"
+            )
+        pieces += [(k, piece) for piece in between if _is_fitted(problem, k, piece)]
+    if len(pieces) == len(recordings):
+        return problem
+    divided = problem.cut(pieces)
+    return divided.with_noise_of(nominal_model(divided, first_starts(divided, nominal(divided))))
+
+
+def _is_fitted(problem: Problem, k: int, piece: slice) -> bool:
+    """Whether most of a piece takes part in fits."""
+    return float(np.mean(problem.fit_nodes(k)[piece])) > _MOSTLY
 
 
 def problem_kind(recordings: Sequence[Recording]) -> type[Problem]:
@@ -104,15 +147,15 @@ def problem_kind(recordings: Sequence[Recording]) -> type[Problem]:
 
 def part_of(problem: Problem, most: int) -> Problem:
     """The problem of pieces of about `most` nodes in all; itself with up to twice as many."""
-    flags = [problem.fit_nodes(k) for k in range(problem.recordings)]
-    nodes = sum(map(len, flags))
+    lengths = [len(problem.fit_nodes(k)) for k in range(problem.recordings)]
+    nodes = sum(lengths)
     if nodes < 2 * most:
         return problem
     pieces = [
         (k, piece)
-        for k, fitted in enumerate(flags)
-        for piece in track.pieces(len(fitted), nodes, most, 1)
-        if float(np.mean(fitted[piece])) > _MOSTLY
+        for k, length in enumerate(lengths)
+        for piece in track.pieces(length, nodes, most, 1)
+        if _is_fitted(problem, k, piece)
     ]
     if not pieces:
         return problem

@@ -46,11 +46,16 @@ class DrivenRun(NamedTuple):
     def cut(self, nodes: slice) -> "DrivenRun":
         """The recording at some of the nodes."""
         fine = slice(2 * self.substeps * nodes.start, 2 * self.substeps * (nodes.stop - 1) + 1)
+        grid, cells = self.grid.cut(nodes), self.cells
+        if cells is not None:
+            there = (cells[0] >= grid.t_s[0]) & (cells[0] <= grid.t_s[-1])
+            cells = cells[0][there], cells[1][there]
         return self._replace(
-            grid=self.grid.cut(nodes),
+            grid=grid,
             applied_n=self.applied_n[nodes],
             fine_n=self.fine_n[fine],
             mechanism=self.mechanism.cut(nodes),
+            cells=cells,
         )
 
     def finer(self) -> "DrivenRun":

@@ -28,6 +28,8 @@ _GAUSS = 1.4826
 """Standard deviation over median absolute deviation of a Gaussian."""
 _LEAST_SWING = 5.0
 """Motion over sensor noise below which no law can be determined."""
+_LEAST_PIECE_S, _LEAST_PIECE_NODES = 0.5, 100
+"""The shortest piece between two gaps that is used: its two initial states are fitted to it."""
 _QUIET = 0.3
 """Share of the RMS velocity below which a block shows too little motion to evaluate on."""
 
@@ -73,6 +75,7 @@ class RecordingGrid(NamedTuple):
         held_out: Nodes that are held out of fits, to evaluate on, shape (N,).
         temperature_c: Temperature at the nodes, shape (N,).
         outliers: Number of heights that were removed as outliers.
+        recording: Index of the recording, of which this may be a piece.
     """
 
     name: str
@@ -83,6 +86,7 @@ class RecordingGrid(NamedTuple):
     temperature_c: Array
     has_temperature: bool
     outliers: int
+    recording: int = 0
 
     @property
     def step_s(self) -> float:
@@ -103,6 +107,17 @@ class RecordingGrid(NamedTuple):
             held_out=self.held_out[nodes],
             temperature_c=self.temperature_c[nodes],
         )
+
+    def pieces_between(self, gaps_s: Sequence[tuple[float, float]]) -> list[slice]:
+        """Nodes between gaps, given by begin and end of each, without pieces that are too short."""
+        begins = [self.t_s[0], *(end for _, end in gaps_s)]
+        ends = [*(begin for begin, _ in gaps_s), self.t_s[-1]]
+        pieces = [
+            slice(*np.searchsorted(self.t_s, (begin, np.nextafter(end, np.inf))).tolist())
+            for begin, end in zip(begins, ends, strict=True)
+            if end - begin >= _LEAST_PIECE_S
+        ]
+        return [piece for piece in pieces if piece.stop - piece.start >= _LEAST_PIECE_NODES]
 
     def blocks(self, length_s: float) -> Integers:
         """Block of each fitted node."""
