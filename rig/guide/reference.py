@@ -210,12 +210,15 @@ def _effect(item: Effect, pictures: Path | None) -> str:
 
 
 def _formula(name: str, law: Force | Rate) -> str:
-    """A law as it is written, over the names of what it reads."""
+    """A law as it is written, over the names of what it reads, with its constants."""
     source = inspect.getsource(law)
     body = source[source.index("->") :].partition(":\n")[2].rstrip()
     names = ", ".join(inspect.signature(law).parameters)
     head = textwrap.fill(f"{name}({names}):", 100, subsequent_indent=" " * (len(name) + 1))
-    return f"{head}\n{body}"
+    function = cast("types.FunctionType", law)
+    values = {item: function.__globals__.get(item) for item in function.__code__.co_names}
+    constants = [f"\n    # {k} = {v:g}" for k, v in values.items() if isinstance(v, int | float)]
+    return f"{head}\n{body}{''.join(constants)}"
 
 
 def _draw(item: Effect, path: Path) -> bool:

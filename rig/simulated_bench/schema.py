@@ -450,7 +450,7 @@ class Transmission(_Section):
         latency_ns: Time from sample to transmission in ns.
         jitter_ns: Largest additional delay in ns; the delay is uniformly distributed from zero to
             this value.
-        loss_probability: Probability that a frame is lost; its counter then shows a gap.
+        loss_probability: Probability that a frame is lost; the message's counter then shows it.
         height: Height sensor, if the message carries one.
         applied_force: Sensor of the applied force, if the message carries one.
         strut_force: Load cell, if the message carries one.
