@@ -15,9 +15,9 @@ from tests.scoreboard.table import page
 TEXT = """
 Published data of measured benches are diagnosed with `rig diagnose`, from a start model; the last
 column states where its parameters are from. Laws and parameters are searched for and fitted on the
-training data. The test data decide two things afterwards. If they are described as well without the
-laws, these are removed. With the verdict `not_explained`, the model with the least error on the test
-data is taken, so that this error is slightly optimistic.
+training data. The test data decide two things afterwards. If all data are described as well without
+the laws, these are removed. With the verdict `not_explained`, the model with the least error on the
+test data is taken, so that this error is slightly optimistic.
 
 A table contains one data set, with one row per model and one column per test. The models called
 `rig` were computed here; the others are published figures from the source in the last column.
