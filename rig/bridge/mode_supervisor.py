@@ -105,7 +105,7 @@ def next_mode(mode: Mode, event: Event) -> Mode:
 
 
 class Supervision(BaseModel):
-    """Ages of the measurement, arming, ramps, the output of the safe state, the table of limits.
+    """Ages of the measurement, arming, ramps, the output of the safe state, the limits.
 
     Attributes:
         stale_after_s: Age of a height (on a dyno also of the load cell's force) from which the

@@ -88,7 +88,7 @@ class _Channel(_Section):
 
     Attributes:
         column: Column of the quantity, by its name or its number (from 1).
-        unit: Unit of the product of gain and reading, such as `mm`, `kN`, `lbf`.
+        unit: Unit of the product of gain and reading, such as `mm`, `kN`, `lbf` or `degC`.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
             sensitivity of the sensor, such as 20 for a height sensor with 20 mm/V, or 500 for a
             load cell with 500 N/V.
