@@ -68,9 +68,9 @@ class JointSpec(_Frozen):
     """Joint between a body and its parent.
 
     Attributes:
-        type: ``prismatic``, ``revolute``, ``ball`` or ``free``.
+        type: `prismatic`, `revolute`, `ball` or `free`.
         axis: Direction of a prismatic or revolute joint in the parent's frame, of any length.
-        parent: Name of the parent body, or ``world``.
+        parent: Name of the parent body, or `world`.
         offset_m: Origin of the joint in the parent's frame.
     """
 
@@ -91,7 +91,7 @@ class BodySpec(_Frozen):
 
     Attributes:
         name: Unique name.
-        mass_kg: Mass.
+        mass_kg: Mass in kg.
         joint: Joint between the body and its parent.
         inertia_kg_m2: Principal moments of inertia about the centre of mass, which is the origin of
             the body's frame. If absent, each moment has the numerical value of the mass (10 kg:
@@ -149,7 +149,7 @@ class EffectSpec(_Frozen):
 
     Attributes:
         name: Name of the effect in the catalogue.
-        parameters: Values of all parameters of the effect, by name.
+        parameters: Values by name; all parameters of the effect are required.
     """
 
     name: str
@@ -196,7 +196,7 @@ class FmuSpec(_Frozen):
         force: Variable of the strut's force in N, positive when it pushes the ends apart.
         acceleration: Instead of `force`, if the FMU models the whole bench: variable of the second
             derivative of the height in m/s². Exactly one of the two is required.
-        mass_kg: Only with `acceleration`: mass that moves along the height.
+        mass_kg: Only with `acceleration`: mass in kg that moves along the height.
         temperature: Input variable for the damper temperature in °C.
         applied_force: Input variable for the applied force in N.
         parameters: Start values of the FMU's parameters, by name.
@@ -225,7 +225,7 @@ class StrutSpec(_Frozen):
     Attributes:
         name: Unique name.
         between: Body at the lower and body at the upper end, in this order; either may be
-            ``world``.
+            `world`.
         free_length_m: Height at which the force of the spring is zero.
         stiffness_n_per_m: Linear stiffness.
         damping_n_s_per_m: Linear damping.
@@ -233,7 +233,8 @@ class StrutSpec(_Frozen):
             frame.
         effects: Effects in addition to the linear spring and damper.
         fmu: A functional mock-up unit (FMU) that computes an additional force in the strut, or
-            (with `acceleration`) replaces the whole guided bench.
+            (with `acceleration`) replaces the whole guided bench. A minus before the name of a
+            variable reverses its sign.
     """
 
     name: Name
@@ -287,7 +288,7 @@ class ModelSpec(_Frozen):
         struts: Spring-dampers; one observer may act on each.
         applied_force_body: Body at whose origin the applied force acts, in the direction of +z; by
             default the upper body of the last strut, or its lower body if the upper one is
-            ``world``.
+            `world`.
         tolerance: Prior standard deviation of the bench's parameters from the values in this file.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """

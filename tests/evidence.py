@@ -42,7 +42,15 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
-def write_evidence(name: str, title: str, text: str, tables: Sequence[str], command: str) -> Path:
+def write_evidence(
+    name: str,
+    title: str,
+    text: str,
+    tables: Sequence[str],
+    command: str,
+    *,
+    with_load: bool = True,
+) -> Path:
     """Write a page of the guide; returns its file.
 
     Args:
@@ -51,23 +59,30 @@ def write_evidence(name: str, title: str, text: str, tables: Sequence[str], comm
         text: What was measured, and how, in Markdown.
         tables: Tables and sentences that hold the figures, in Markdown.
         command: What measured them.
+        with_load: Whether the machine's load matters, because the figures contain times.
     """
     path = FOLDER / f"{name}.md"
     path.parent.mkdir(exist_ok=True)
-    parts = [f"# {title}", text.strip(), *tables, f"Measured with\n\n    {command}\n\n{_origin()}"]
+    parts = [
+        f"# {title}",
+        text.strip(),
+        *tables,
+        f"Measured with\n\n    {command}\n\n{_origin(with_load)}",
+    ]
     path.write_text("\n\n".join(parts) + "\n", "utf-8")
     return path
 
 
-def _origin() -> str:
+def _origin(with_load: bool) -> str:
     commit = subprocess.run(
         ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
         capture_output=True, text=True, check=False,
     ).stdout.strip()  # fmt: skip
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     packages = ", ".join(f"{name} {version_of(name)}" for name in ("dartpy", "numpy", "python-can"))
+    load = f", 15-minute load average {os.getloadavg()[2]:.1f}" if with_load else ""
     return (
         f"on {today}, rig {version_of('rig')} (commit {commit or 'unknown'}), Python "
         f"{'.'.join(map(str, sys.version_info[:3]))}, {packages}, {platform.system()} on "
-        f"{os.cpu_count()} cores, 15-minute load average {os.getloadavg()[2]:.1f}."
+        f"{os.cpu_count()} cores{load}."
     )

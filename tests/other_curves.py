@@ -27,13 +27,15 @@ FIGURES = (
     "peak force, N",
 )
 TEXT = """
-The paper of the method does not give the curves of its spring and damper. Those of the shipped
+Cuesta, Luque and Mantaras (2021), whose [method](../explanation/method.md) this is, do not give the
+curves of their spring and damper. Those of the shipped
 reference bench were chosen so that the published errors result (2.5 mm of height and 1.14 % of the
 peak force). This page shows the errors with other curves: the slopes of the spring curve and of the
 damper curve are multiplied by a smooth factor, drawn at random between 0.5 and 2. Observer and
-model are those of the reference case. Each bench runs over CAN in lockstep for 20 s; the first
-{settled_s:g} s are not evaluated. An error is the difference between the estimate and the simulated
-bench.
+model are those of the reference case. Each bench runs in lockstep for 20 s, and its values are
+encoded in CAN frames; the first {settled_s:g} s are not evaluated. An error is the model's height,
+or the estimated force, less that of the simulated bench. The peak force is the largest magnitude of
+the simulated strut force in the evaluated time.
 """
 
 
@@ -81,10 +83,11 @@ def write_page(rows: list[tuple[float, float, float, float]]) -> None:
         "The reference case with other curves",
         TEXT.format(settled_s=SETTLED_NS * 1e-9),
         [
-            table(("over all benches", "median", "smallest", "largest"), spread),
+            table((f"over the {len(rows)} benches", "median", "smallest", "largest"), spread),
             table(("bench", *FIGURES), benches),
         ],
         command_line(),
+        with_load=False,
     )
 
 

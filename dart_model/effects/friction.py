@@ -66,8 +66,8 @@ def _presliding_rate(velocity_m_per_s: float, deflection: float, presliding_m: f
 
 
 def _elastoplastic_rate(velocity_m_per_s: float, deflection: float, presliding_m: float) -> float:
-    # Elastic up to the limit, then sliding. Near the limit it settles instead of stopping: a force
-    # that jumped by where in a step it slips would have no derivative by the parameters.
+    # Elastic up to the limit, then sliding. The deflection approaches the limit gradually: if it
+    # stopped there within a step, the force could not be differentiated by the parameters.
     speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
     if velocity_m_per_s * deflection > 0.0:
         speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(deflection)), 0.0))

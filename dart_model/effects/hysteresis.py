@@ -60,9 +60,9 @@ def _iwan(elements: Floats, yield_force_n: float) -> float:
 def _iwan_rate(
     velocity_m_per_s: float, elements: Floats, yield_displacement_m: float, rates: Writable
 ) -> None:
-    # Elements of equal stiffness slip one after another, each elastic up to its limit. Near there
-    # it settles instead of stopping: a force that jumped by where in a step it slips would have no
-    # derivative by the parameters.
+    # Elements of equal stiffness slip one after another, each elastic up to its limit, which it
+    # approaches gradually: if it stopped there within a step, the force could not be differentiated
+    # by the parameters.
     speed = velocity_m_per_s / (yield_displacement_m * ELEMENTS)
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
@@ -89,8 +89,8 @@ def _general_bouc_wen_rate(
     exponent: float,
     angle_rad: float,
 ) -> float:
-    # beta = cos(angle) is not negative, so that a loop takes energy (Erlicher and Point). With
-    # gamma = sin(angle) below -beta, the slope grows without bound: both ratio and rate are held.
+    # beta = cos(angle) is not negative, so that a loop dissipates energy (Erlicher and Point). With
+    # gamma = sin(angle) below -beta, the slope grows without bound: ratio and rate are limited.
     speed = velocity_m_per_s / bend_m
     limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
     ratio = min(abs(spring_deflection_m / bend_m), _LARGEST_RATIO) ** exponent
@@ -110,12 +110,12 @@ def _behind_play_rate(
     velocity_m_per_s: float, deflection_m: float, gap_m: float, travel_m: float, exponent: float
 ) -> float:
     # The state is the deflection of play and elastic travel together, in m. It follows the strut
-    # except while the slider is pushed further, when it is the slider that gives way.
+    # unless the slider slips.
     beyond = max(abs(deflection_m) - 0.5 * gap_m, 0.0) / travel_m
     if beyond <= 0.0 or velocity_m_per_s * deflection_m <= 0.0:
         return velocity_m_per_s
     if beyond > 1.0:
-        # A step that overshoots full force is led back to it.
+        # After a step that overshoots full force, the deflection returns to it.
         back = min((beyond - 1.0) * 300.0, _FASTEST_SETTLING_PER_S)
         return -math.copysign(back * travel_m, deflection_m)
     fastest = _FASTEST_SETTLING_PER_S * travel_m

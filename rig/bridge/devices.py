@@ -37,11 +37,12 @@ class DeviceSettings(BaseModel):
     """A device that reports its state; its frames are refused while it is at fault.
 
     Attributes:
-        node_id: Node id of a CANopen device; a device has either this or `j1939_name`.
-        emergency_id: Arbitration id of the device's emergency frames; 128 plus the node id if
+        node_id: Node id of a CANopen device. Either this or `j1939_name` is required.
+        emergency_id: Arbitration id of a CANopen device's emergency frames; 128 plus the node id if
             absent.
-        heartbeat_s: Longest permitted time between two heartbeats; not monitored if absent.
-        alarms: Signals that are not zero while the device is at fault.
+        heartbeat_s: Longest permitted time between two heartbeats of a CANopen device; not
+            monitored if absent.
+        alarms: List of signals that are not zero while the device is at fault.
         j1939_name: NAME of a J1939 device: the 64 bits with which it claims its address; requires
             `source_address`.
         source_address: Address of a J1939 device at the start; a later address claim changes it.

@@ -105,31 +105,38 @@ def next_mode(mode: Mode, event: Event) -> Mode:
 
 
 class Supervision(BaseModel):
-    """Ages of the measurement, arming, ramps, the output of the safe state, the table of limits.
+    """Ages of the measurement, arming, ramps, the output of the safe state, the limits.
 
     Attributes:
-        stale_after_s: Age of a height or applied force from which the estimate is invalid (HOLD).
-        safe_after_s: Age of a height or applied force from which the bridge enters the safe state.
+        stale_after_s: Age of a height (on a dyno also of the load cell's force) from which the
+            estimate is invalid (HOLD). For the applied force it is three of its cycles, if that is
+            longer.
+        safe_after_s: Age of a height, of the applied force or (on a dyno) of the load cell's force
+            from which the bridge enters the safe state. If three cycles of the applied force are
+            longer than `stale_after_s`, they extend this age, too, by the difference.
         settling_s: Time after a start, a gap, a change of gains or a saturated virtual force until
             an estimate is valid. By default the time after which the error that a step of the
             residual force causes in the closed loop has decayed to a hundredth of the step; for
             `kalman` the filter's variance decides.
-        overload_share: Share of missed ticks among the last few hundred from which the estimate is
-            invalid (HOLD).
+        overload_share: The estimate is invalid (HOLD) while more than this share of the last few
+            hundred ticks was missed.
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
             has to arm the bridge first, after each start and each safe state.
         fade_in_s: Time in which the published force fades in, from the safe output to the
             estimate, before the estimate is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
-            output. Without `fade_in_s` and `slew_n_per_s`, the model's force is published in HOLD,
-            and the safe output at once in SAFE.
+            output. With `fade_in_s` alone, the safe output is published at once in HOLD and SAFE.
+            With neither key, the model's force is published in HOLD, and the safe output at once
+            in SAFE.
         watchdog: Whether a second process sends the safe output if the loop stands still for
             `safe_after_s` or its process dies; only on interfaces that several processes can share.
         log_fault: Reaction to a log that cannot be written: `continue`, or `safe` for the safe
             state.
         safe_output: Force that is published in the safe state: `zero`, or the `last` valid one.
-        limits: Table of limits. For a measured height, an applied force, a further sensor, a model
-            height or a published force without a row, the range of its signal in the DBC applies.
+        limits: List of limits. A value without an entry has the range of its signal in the DBC as
+            its limit: a height, an applied force or a further sensor beyond it is refused, and a
+            published force beyond it leads to HOLD. A model height that leaves the range of the
+            measured height by a tenth of its span leads to SAFE.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -58,7 +58,8 @@ FORCE = _of_strut(
     Dimension.FORCE,
     "force_n",
     "SPRING_DAMPER_FORCE",
-    "force of the strut, positive when it pushes its ends apart: the estimate while `valid` is 1",
+    "force of the strut, positive when it pushes its ends apart: the estimate while `valid` is 1 "
+    "(on a dyno the load cell's force)",
 )
 VALID = _of_strut(
     "valid", Dimension.NUMBER, "valid", "VALID", "1 while the estimate is valid, else 0"
@@ -70,7 +71,8 @@ ESTIMATE = (
         Dimension.FORCE,
         "virtual_force_n",
         "VIRTUAL_FORCE",
-        "virtual force of the observer, positive when it pushes the ends apart",
+        "virtual force of the observer, positive when it pushes the ends apart; on a dyno the load "
+        "cell's force less the model's",
     ),
     VALID,
 )
@@ -192,7 +194,8 @@ STATUS = (
     ),
     _status(
         "bus_fault",
-        "1 if the bus failed, or a second sender was detected, since the last status",
+        "1 if the bus failed, a second sender was detected, or a frame was refused as not "
+        "authentic, since the last status",
         _is_bus_faulty,
     ),
     _status(

@@ -63,12 +63,13 @@ _OF_CHANNELS_ALONE = (LimitedValue.MEASURED, LimitedValue.MEASURED_RATE_PER_S)
 
 
 class Limit(BaseModel):
-    """One row of the table of limits.
+    """One entry of the list of limits.
 
     Attributes:
         strut: Strut to which the limit applies; every strut if absent.
-        channel: Measured signal, other than a height, to which the limit applies: a key of
-            `signals` such as `applied_force`, or a further sensor as `strut.sensor`.
+        channel: Measured signal to which the limit applies, other than one under
+            `signals.height`: a key of `signals` such as `applied_force`, or a further sensor as
+            `STRUT.SENSOR`. If absent, the limit applies to a height or an estimate.
         value: Limited value, in SI units. Of a measured height: `measured_height_m`,
             `measured_rate_m_per_s`, or `unchanged_s` (time for which the reading stays exactly the
             same). Of another measured signal (`channel`): `measured`, `measured_rate_per_s` or
@@ -81,11 +82,13 @@ class Limit(BaseModel):
         for_s: Time for which a value of the estimate has to be beyond the limit until the action
             begins.
         clear_s: Time for which a value of the estimate has to be within the limit until the action
-            ends; by default `for_s`, and at least 1 s for `force_difference_n`, because a wrong
-            force that oscillates crosses the right one.
-        action: `warn` reports the value in the status. `refuse` also refuses the frame of a
-            measurement. `hold` makes the estimate invalid while the value is beyond the limit;
-            `safe` enters the safe state. For a measurement, these two refuse its frame, too.
+            ends (the safe state lasts until it is acknowledged); by default `for_s`, and at least
+            1 s for `force_difference_n`, because a wrong force that oscillates crosses the right
+            one.
+        action: `warn` reports the value in the status (`limit_fault`), as each of the others does.
+            `refuse` refuses the frame of a measurement. `hold` makes the estimate invalid while the
+            value is beyond the limit; `safe` enters the safe state. For a measurement, `hold` and
+            `safe` refuse its frame, too.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -56,7 +56,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
     """What a tick publishes of one strut; each attribute is a column of the log.
 
     Attributes:
-        force_n: Estimated spring-damper force: the law's, and the residual force.
+        force_n: Estimated strut force: the model's plus the estimated residual force.
         virtual_force_n: Virtual force.
         valid: Whether the estimate rests on fresh measurements and has settled.
         height_m: Model height.

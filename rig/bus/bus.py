@@ -79,9 +79,11 @@ class BusConfig:
     Attributes:
         interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
         channel: Channel of the interface.
-        bitrate: Bit rate in bit/s; with `socketcan` that of the interface, which `ip link` sets.
-        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
-        options: Further arguments of python-can's interface.
+        bitrate: Bit rate in bit/s. With `socketcan` the key does not set it: state the rate that
+            was set with `ip link`, from which `rig check` computes the bus load.
+        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent. With `socketcan`
+            `ip link` sets it, too.
+        options: Further arguments of python-can's interface, by name.
     """
 
     interface: _Name = "virtual"

@@ -71,9 +71,9 @@ class AuthenticationSettings(BaseModel):
         clock_tolerance_s: Largest difference between the clocks of bench and bridge at the start.
             Even a bridge that has just been started refuses a frame that was recorded longer ago
             than this.
-        max_age_s: Largest age of a frame during the run by the bridge's clock, and its largest lead
-            over this clock; larger than the tolerance to allow for clocks that drift apart. A value
-            below `clock_tolerance_s` counts as `clock_tolerance_s`.
+        max_age_s: During the run, largest difference between the time of a frame and the bridge's
+            clock, in either direction. It is larger than `clock_tolerance_s` because the clocks may
+            drift apart; a smaller value counts as `clock_tolerance_s`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field
@@ -70,17 +70,21 @@ class MeasuredSignal(SignalName):
         valid: Signal of the same message that shows whether the sensor measures; a frame in which
             this signal does not have `valid.value` is refused. If absent, every value is used.
         counter: Signal of the same message that rises by one with every frame, for a message
-            without E2E protection. It shows frames that are lost, repeated or out of sequence, and
-            with the cycle time the times of the samples.
+            without E2E protection. It shows frames that are lost, repeated or out of sequence. If
+            the DBC has the message's cycle time, the times of the samples follow from the counter.
+            If absent, lost frames are not counted.
         time: Signal of the same message with the sensor's time of the sample; it may restart at the
-            end of its range.
-        zero: For a height: a reading at a known length of the strut. Without it the reading is the
-            length.
-        reversed: True if the reading falls while the quantity grows; only for a height with a zero,
-            a velocity or a force.
-        tare_n: For a force: the reading without a force, in N after the scaling by the DBC, and
-            before a reversal; 0 if absent.
+            end of its range. If absent, this time follows from the message's counter, or else from
+            the arrival of the frame.
+        zero: A reading at a known length of the strut; if absent, the reading is the length.
+        reversed: True if the reading falls while the quantity grows; only for a force.
+        tare_n: Only for a force: the reading without a force, in N after the scaling by the DBC,
+            and before a reversal; 0 if absent.
     """
+
+    refused_keys: ClassVar[frozenset[str]] = frozenset({"zero"})
+    """Keys that the plan refuses here, and that the guide therefore leaves out: those of a sensor
+    of another dimension. This class itself stands for the quantities of the bench."""
 
     valid: ValidSignal | None = None
     counter: SignalOfMessage | None = None

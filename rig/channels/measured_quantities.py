@@ -77,7 +77,7 @@ LOAD_CELL_FORCE = Quantity(
     "load_cell_force",
     "strut_force_n",
     Dimension.FORCE,
-    "force of the strut by a load cell, positive when the strut pushes its ends apart",
+    "force of the strut, measured by a load cell, positive when the strut pushes its ends apart",
 )
 TEMPERATURE = Quantity(
     "temperature", "temperature_c", Dimension.TEMPERATURE, "temperature of the damper"

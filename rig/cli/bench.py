@@ -12,7 +12,6 @@ from rig.cli.summary_file import write_summary
 from rig.cli.terminal import (
     Bitrate,
     Channel,
-    ConfigFile,
     Interface,
     JsonFlag,
     console,
@@ -31,6 +30,10 @@ EXAMPLES = (
 )
 
 
+BenchFile = Annotated[
+    Path,
+    typer.Argument(metavar="CONFIG", help="Configuration of a simulated bench, a YAML file."),
+]
 Dbc = Annotated[
     Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
 ]
@@ -41,7 +44,7 @@ Bridge = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Take bus, DBC and authentication from a bridge's configuration instead.",
+        help="Configuration of a bridge: take bus, DBC and authentication from it instead.",
     ),
 ]
 Lockstep = Annotated[
@@ -65,7 +68,7 @@ Out = Annotated[
 
 
 def bench(
-    config: ConfigFile,
+    config: BenchFile,
     interface: Interface = "socketcan",
     channel: Channel = "vcan0",
     bitrate: Bitrate = 1_000_000,
@@ -77,7 +80,10 @@ def bench(
     out: Out = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a simulated bench on a bus, in real time, or together with its bridge."""
+    """Run a simulated bench on a bus in real time, or with its bridge in simulated time.
+
+    The second way, --lockstep, uses no bus.
+    """
     from rig.bus.bus import BusConfig
     from rig.plan.load import load_plan
 

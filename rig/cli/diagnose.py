@@ -23,7 +23,8 @@ def diagnose(
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="RUN", help="Run that takes no part in the search and the fit; may be repeated."
+            metavar="RUN",
+            help="Run or CSV file that takes no part in the search and the fit; may be repeated.",
         ),
     ] = None,
     pdf: Annotated[

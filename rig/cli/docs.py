@@ -55,7 +55,8 @@ def _command(name: str, command: Any, context: Any) -> str:
         record = parameter.get_help_record(context)
         shown, text = record or (parameter.make_metavar(context), parameter.help or "")
         if parameter.param_type_name == "argument":
-            arguments.append(shown)
+            name_of_it = shown if parameter.required else f"[{shown}]"
+            arguments.append(name_of_it if parameter.nargs == 1 else f"{name_of_it}...")
         rows.append(f"| `{shown}` | {text.replace('|', chr(92) + '|')} |")
     parts = [
         f"## {name}",

@@ -52,10 +52,10 @@ app = typer.Typer(
 )
 
 RUN_EXAMPLES = (
-    "Examples: `rig fleet runs --model damper.yaml --out store` · "
-    "`rig fleet week_30 --path '{bench}/{date}/{damper}' --model damper.yaml --out store` · "
-    "`rig fleet s3://lab/runs --model damper.yaml --out store --dask tcp://head:8786` · "
-    "`rig fleet runs --model damper.yaml --out store --shard $SLURM_ARRAY_TASK_ID/64`"
+    "Examples: `rig fleet run runs --model damper.yaml --out store` · "
+    "`rig fleet run week_30 --path '{bench}/{date}/{damper}' --model damper.yaml --out store` · "
+    "`rig fleet run s3://lab/runs --model damper.yaml --out store --dask tcp://head:8786` · "
+    "`rig fleet run runs --model damper.yaml --out store --shard $SLURM_ARRAY_TASK_ID/64`"
 )
 QUERY_EXAMPLES = (
     'Examples: `rig fleet query store "SELECT bench, verdict, count(*) FROM runs GROUP BY ALL"` · '
@@ -115,6 +115,7 @@ def run_command(
 
     What is in the store is not computed again: the same command continues a fleet that was
     interrupted. A run that fails gets a row with its error; the exit code is then 1.
+    `rig fleet SOURCE...` is short for `rig fleet run SOURCE...`.
     """
     from dart_model.spec import model_file
     from rig.fleet.campaign import load_fleet_model, run_campaign
@@ -192,9 +193,10 @@ def query_command(
 ) -> None:
     """Query a store in SQL (DuckDB): one SELECT statement, which opens no other file.
 
-    `runs` has one row per run, `effects` one row per parameter of the model (kind `model`) or of an
-    effect that the model lacks (`found`); `values` also has the figures of `rig characterise`
-    (`figure`).
+    `runs` has one row per run. `values` has one row per number, with the column `kind`: `model`
+    (a parameter of the model), `found` (a parameter of an effect that the model lacks, or its
+    `force_rms_n`) or `figure` (a figure of `rig characterise`). `effects` is `values` without the
+    figures.
     """
     from rig.fleet.store import query
 
@@ -224,7 +226,7 @@ def report_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Summarise a store: verdicts, change-points, wear, outliers, jumps of a bench."""
+    """Summarise a store: verdicts, changes, wear, outliers, common steps of a bench's dampers."""
     from rig.fleet.overview import read_overview
 
     refuse_existing(out)

@@ -67,7 +67,12 @@ def import_command(
     rebound: Rebound = None,
     fmu: FmuFlag = False,
     mass_kg: Annotated[
-        float | None, typer.Option(metavar="KG", help="With --fmu: mass that the strut carries.")
+        float | None,
+        typer.Option(
+            metavar="KG",
+            help="With --fmu: mass that the strut carries; of the FMU of a bench, its mass instead "
+            "of the computed one.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:

@@ -58,7 +58,12 @@ LoadCell = Annotated[
 ]
 Mass = Annotated[
     float | None,
-    typer.Option(metavar="KG", min=1e-3, max=1e6, help="Mass that the strut carries, in kg."),
+    typer.Option(
+        metavar="KG",
+        min=1e-3,
+        max=1e6,
+        help="Mass that the strut carries, in kg; 10 by default with --dyno.",
+    ),
 ]
 LengthAtRest = Annotated[
     float | None,

@@ -28,7 +28,8 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder of the run, or of the runs; by default runs/ and the time."
+            metavar="DIR",
+            help="Folder of the run, or of the runs; by default runs/ with date and time.",
         ),
     ] = None,
     model: Annotated[
@@ -50,7 +51,10 @@ def run(
         bool, typer.Option("--force", help="Run although `rig check` finds an error.")
     ] = False,
     trace: Annotated[
-        bool, typer.Option("--trace", help="Record the parts of late ticks for `rig timing`.")
+        bool,
+        typer.Option(
+            "--trace", help="Record how long each part of a late tick takes, for `rig timing`."
+        ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

@@ -54,7 +54,8 @@ EdsFiles = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NODE=FILE",
-        help="Describe a sensor that is not connected by its EDS file; no bus is opened.",
+        help="EDS file of the sensor with this node id, which need not be connected: no bus is "
+        "opened. May be repeated.",
     ),
 ]
 CycleMs = Annotated[
@@ -67,7 +68,8 @@ Before = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="New file for the previous contents; sensor-NODE-before.yaml by default.",
+        help="New file for the previous values of the changed objects of the device; "
+        "sensor-NODE-before.yaml by default.",
     ),
 ]
 
@@ -124,13 +126,15 @@ def scan_command(
 @app.command("set", epilog=SET_EXAMPLES, cls=PlainCommand)
 def set_command(
     node_id: Annotated[
-        int | None, typer.Argument(metavar="[NODE]", min=1, max=127, help="CANopen node id.")
+        int | None, typer.Argument(metavar="NODE", min=1, max=127, help="CANopen node id.")
     ] = None,
     cycle_ms: CycleMs = None,
     sync: Annotated[
         bool,
         typer.Option(
-            "--sync", help="Send at SYNC messages, which the device then produces itself."
+            "--sync",
+            help="Send at SYNC messages, which the device then produces itself; requires "
+            "--cycle-ms.",
         ),
     ] = False,
     heartbeat_ms: HeartbeatMs = None,
@@ -141,7 +145,9 @@ def set_command(
     restore_from: Annotated[
         Path | None,
         typer.Option(
-            "--restore", metavar="FILE", help="Write the previous contents in this file back."
+            "--restore",
+            metavar="FILE",
+            help="Write the values in this file, which --before named, back to the device.",
         ),
     ] = None,
     interface: Interface = "socketcan",

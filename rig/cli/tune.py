@@ -68,8 +68,9 @@ GainMargin = Annotated[
         metavar="FACTOR",
         min=1.0,
         max=20.0,
-        help="Gain margin: factor by which the response of the bench may be larger, or smaller, "
-        "than the model's while the loop stays stable; 1.1 for kalman and 2 for pi by default.",
+        help="Required gain margin: factor by which the response of the bench may be larger, or "
+        "smaller, than the model's while the loop stays stable; 1.1 for kalman and 2 for pi by "
+        "default.",
     ),
 ]
 
@@ -79,8 +80,8 @@ SettlingTime = Annotated[
         metavar="S",
         min=0.001,
         max=60.0,
-        help="Longest time until an estimate is valid after a start or a disturbance; 0.25 for "
-        "kalman, unlimited for pi by default.",
+        help="Longest permitted time until an estimate is valid after a start or a disturbance; "
+        "0.25 for kalman, unlimited for pi by default.",
     ),
 ]
 
@@ -103,7 +104,10 @@ def tune_command(
     damping_ratio: Annotated[
         float,
         typer.Option(
-            metavar="RATIO", min=0.0, max=1.0, help="Smallest damping ratio of all poles."
+            metavar="RATIO",
+            min=0.0,
+            max=1.0,
+            help="Damping ratio that every pole of the loop must have at least.",
         ),
     ] = 0.1,
     gain_margin: GainMargin = None,

@@ -52,7 +52,9 @@ def view(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folders.")],
     model: Annotated[
         list[str] | None,
-        typer.Option(metavar="MODEL", help="Also draw the law of this model; may be repeated."),
+        typer.Option(
+            metavar="MODEL", help="Also draw the strut force of this model; may be repeated."
+        ),
     ] = None,
     port: Port = None,
     control: ControlFlag = False,

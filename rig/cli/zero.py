@@ -56,7 +56,11 @@ def zero_command(
     run: FromRun = None,
     is_remounted: Annotated[
         bool,
-        typer.Option("--remounted", help="The sensor was moved since its last zero."),
+        typer.Option(
+            "--remounted",
+            help="The sensor was moved since its last zero: do not determine direction and scale "
+            "from that zero.",
+        ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

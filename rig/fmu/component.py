@@ -92,8 +92,8 @@ def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
     )
     if carried:
         meaning += (
-            f" Not in the force: {', '.join(carried)}; add the mass to the body that the strut "
-            "carries."
+            f" Not in the force: {', '.join(carried)}; add the mass, with its weight, to the body "
+            "that the strut carries."
         )
     return made.component(spec.name, f"{spec.name}_{strut.name}", meaning, text)
 

@@ -28,7 +28,7 @@ class TextLayout(_Section):
     """Layout of a text table.
 
     Attributes:
-        separator: One character, ``tab``, or ``whitespace`` for any run of spaces and tabs.
+        separator: One character, `tab`, or `whitespace` for any run of spaces and tabs.
         decimal: Decimal sign: a point or a comma.
         encoding: Character encoding, by its name in Python.
         skip_lines: Lines before the column names, or before the data where there are no names.
@@ -61,8 +61,8 @@ class TimeColumn(_Section):
 
     Attributes:
         column: Column of the time, by its name or its number (from 1).
-        unit: Unit of a column of numbers, such as ``s`` or ``ms``.
-        date_format: Format of a column of dates, as for C's ``strptime``, or ``iso`` for ISO 8601;
+        unit: Unit of a column of numbers, such as `s` or `ms`.
+        date_format: Format of a column of dates, as for C's `strptime`, or `iso` for ISO 8601;
             only for text tables.
         sampling_rate_hz: Rows per second, if the table has no column of times.
     """
@@ -88,7 +88,7 @@ class _Channel(_Section):
 
     Attributes:
         column: Column of the quantity, by its name or its number (from 1).
-        unit: Unit of the product of gain and reading, such as ``mm``, ``kN``, ``lbf``.
+        unit: Unit of the product of gain and reading, such as `mm`, `kN`, `lbf` or `degC`.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
             sensitivity of the sensor, such as 20 for a height sensor with 20 mm/V, or 500 for a
             load cell with 500 N/V.

@@ -26,7 +26,7 @@ from rig.files.pictures import Figure
 from rig.formats.mapping import TableMapping
 from rig.guide.site import Block
 from rig.observers import OBSERVERS
-from rig.plan.config import OneOf, RunConfig
+from rig.plan.config import KeyName, OneOf, RunConfig
 from rig.simulated_bench.effects import EFFECT_KINDS, EffectParameter
 from rig.simulated_bench.schema import BenchConfig
 
@@ -210,12 +210,15 @@ def _effect(item: Effect, pictures: Path | None) -> str:
 
 
 def _formula(name: str, law: Force | Rate) -> str:
-    """A law as it is written, over the names of what it reads."""
+    """A law as it is written, over the names of what it reads, with its constants."""
     source = inspect.getsource(law)
     body = source[source.index("->") :].partition(":\n")[2].rstrip()
     names = ", ".join(inspect.signature(law).parameters)
     head = textwrap.fill(f"{name}({names}):", 100, subsequent_indent=" " * (len(name) + 1))
-    return f"{head}\n{body}"
+    function = cast("types.FunctionType", law)
+    values = {item: function.__globals__.get(item) for item in function.__code__.co_names}
+    constants = [f"\n    # {k} = {v:g}" for k, v in values.items() if isinstance(v, int | float)]
+    return f"{head}\n{body}{''.join(constants)}"
 
 
 def _draw(item: Effect, path: Path) -> bool:
@@ -263,19 +266,31 @@ def _loop(item: Effect, parameters: list[float]) -> tuple[Array, Array, Array]:
 
 
 def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Key, default and meaning of every key of a configuration and of its sections."""
+    """Key, default and meaning of every key of a configuration and of its sections.
+
+    In a key, a word in capitals stands for the keys of a mapping, and `[]` for the entries of a
+    list.
+    """
     meanings = _attributes(model)
     fields = cast("Mapping[str, FieldInfo]", getattr(model, _FIELDS))
-    for name, field in fields.items():
-        if getattr(field, "exclude", False):
-            continue
-        default = field.get_default(call_default_factory=True)
-        sections = _sections(field.annotation)
+    refused = getattr(model, "refused_keys", frozenset[str]())
+    keys = [
+        (name, field.annotation, field.get_default(call_default_factory=True))
+        for name, field in fields.items()
+        if not getattr(field, "exclude", False) and name not in refused
+    ]
+    extra = inspect.get_annotations(model).get("__pydantic_extra__")
+    if extra is not None:
+        word, value = typing.get_args(extra)
+        keys.append((_word(word), value, None))
+    for name, annotation, default in keys:
         meaning = meanings.get(name, "")
+        sections = _sections(annotation)
         if sections:
-            first = (inspect.getdoc(sections[0]) or "").partition("\n")[0]
-            yield f"{prefix}{name}", _section_default(default), meaning or first
-            yield from _alternatives(sections, f"{prefix}{name}.")
+            at, first = sections[0]
+            words = (inspect.getdoc(first) or "").partition("\n")[0]
+            yield f"{prefix}{name}", _section_default(default), meaning or words
+            yield from _alternatives([item for _, item in sections], f"{prefix}{name}{at}.")
         else:
             text = "required" if default is PydanticUndefined else _default_text(default)
             yield f"{prefix}{name}", text, meaning
@@ -291,22 +306,39 @@ def _section_default(default: object) -> str:
 def _alternatives(sections: Sequence[type[object]], prefix: str) -> Iterator[tuple[str, str, str]]:
     """One row for each key of alternative sections, with each of its meanings.
 
-    A key that only some of them have is followed by the choice that these are; without such a
-    choice, it is not required.
+    A key that only some of them have, or require, is followed by the choice that these are;
+    without such a choice, it is not required.
     """
-    by_key: dict[str, list[tuple[str, str]]] = {}
-    having: dict[str, list[type[object]]] = {}
+    by_key: dict[str, list[tuple[type[object], str, str]]] = {}
     for section in sections:
         for key, default, meaning in _rows(section, prefix):
-            by_key.setdefault(key, []).append((default, meaning))
-            having.setdefault(key, []).append(section)
+            by_key.setdefault(key, []).append((section, default, meaning))
     for key, same in by_key.items():
-        default, meaning = same[0][0], " ".join(dict.fromkeys(text for _, text in same))
+        default, meaning = same[0][1], _joined_meaning(key, same)
+        requiring = [section for section, text, _ in same if text == "required"]
+        if 0 < len(requiring) < len(same) and not _is_choice(key, same[0][0]):
+            default = next(text for _, text, _ in same if text != "required")
+            meaning += f" Required with {_choice(requiring)}."
         if len(same) < len(sections) and "." not in key.removeprefix(prefix):
-            choice = _choice(having[key])
+            choice = _choice([section for section, *_ in same])
             meaning += choice and f" Only with {choice}."
             default = "" if default == "required" and not choice else default
         yield key, default, meaning
+
+
+def _joined_meaning(key: str, same: Sequence[tuple[type[object], str, str]]) -> str:
+    """Meaning of a key of alternative sections: one text, or one for each choice."""
+    having: dict[str, list[type[object]]] = {}
+    for section, _, text in same:
+        having.setdefault(text, []).append(section)
+    if len(having) == 1 or _is_choice(key, same[0][0]):
+        return " ".join(having)
+    return " ".join(f"With {_choice(those)}: {text}" for text, those in having.items())
+
+
+def _is_choice(key: str, section: type[object]) -> bool:
+    """Whether a key of alternative sections is the one that selects the section."""
+    return _choice([section]).startswith(f"`{key.rpartition('.')[2]}: ")
 
 
 def _choice(sections: Sequence[type[object]]) -> str:
@@ -322,24 +354,45 @@ def _choice(sections: Sequence[type[object]]) -> str:
 
 
 def _default_text(default: object) -> str:
+    """A default as YAML, in code; none for a key that is absent."""
     if default is None or default in ((), {}):
         return "none"
-    if isinstance(default, tuple):
-        return f"[{', '.join(map(_default_text, cast('tuple[object, ...]', default)))}]"
-    return str(default) if isinstance(default, str | int | float | bool) else ""
+    text = _yaml(default)
+    return text and f"`{text}`"
 
 
-def _sections(annotation: object) -> list[type[object]]:
-    """Sections that a key may hold, also in unions, tuples and mappings."""
+def _yaml(value: object) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_yaml, cast('tuple[object, ...]', value)))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value) if isinstance(value, str | int | float) else ""
+
+
+def _sections(annotation: object, at: str = "") -> list[tuple[str, type[object]]]:
+    """Sections that a key may hold, also in unions, tuples and mappings.
+
+    Each is preceded by what follows the key: `.STRUT` for a mapping, `[]` for a list.
+    """
     if isinstance(annotation, type) and hasattr(annotation, _FIELDS):
-        return [annotation]
+        return [(at, annotation)]
     kinds = [item for item in getattr(annotation, "__metadata__", ()) if isinstance(item, OneOf)]
     if kinds:
-        return list(kinds[0].choices.values())
-    origin = typing.get_origin(annotation)
-    if origin in (typing.Union, types.UnionType, tuple, dict, typing.Annotated):
-        return [section for part in typing.get_args(annotation) for section in _sections(part)]
+        return [(at, section) for section in kinds[0].choices.values()]
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is dict:
+        name, value = parts
+        return _sections(value, f"{at}.{_word(name)}")
+    if origin in (typing.Union, types.UnionType, tuple, typing.Annotated):
+        at += "[]" if origin is tuple else ""
+        return [section for part in parts for section in _sections(part, at)]
     return []
+
+
+def _word(name: object) -> str:
+    """The word that stands for the keys of a mapping."""
+    metadata = getattr(name, "__metadata__", ())
+    return next((item.word for item in metadata if isinstance(item, KeyName)), "NAME")
 
 
 def _attributes(model: type[object]) -> dict[str, str]:

@@ -92,8 +92,7 @@ class KalmanObserver:
 
     Attributes:
         kind: `kalman`: the noise-aware observer.
-        filter: Kalman filter of the model's error, required for `kalman`; `rig tune` chooses its
-            bandwidth.
+        filter: Kalman filter of the model's error; `rig tune` chooses its bandwidth.
         force_limit_n: Largest magnitude of the virtual force.
     """
 

@@ -94,8 +94,8 @@ class PiObserver:
         derivative_n_s_per_m: Derivative gain, on the time derivative of the innovation; requires
             `filter`.
         force_limit_n: Largest magnitude of the virtual force.
-        filter: Filter that predicts the present innovation; if absent, `pi` uses the last
-            innovation.
+        filter: Kalman filter of the model's error, which predicts the present innovation; if
+            absent, the last innovation is used.
     """
 
     requires_height: ClassVar[bool] = True

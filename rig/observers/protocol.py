@@ -65,7 +65,7 @@ class ObserverState(Protocol):
 
     @property
     def residual_force_n(self) -> float:
-        """Estimate of the force that the model's law lacks; published with the law's own."""
+        """Estimate of the residual force; published together with the model's own."""
         ...
 
     @property

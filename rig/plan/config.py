@@ -1,8 +1,9 @@
 """Configuration of the bridge: YAML -> frozen values, validated once."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 from pydantic import (
     BaseModel,
@@ -17,6 +18,7 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import tagged_union_schema
 
 from can_dbc.errors import expected_name
+from can_dbc.units import Dimension
 from can_dbc.yaml_file import Finite, Positive
 from rig.bridge.devices import DeviceSettings
 from rig.bridge.mode_supervisor import Supervision
@@ -52,6 +54,16 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+@dataclass(frozen=True)
+class KeyName:
+    """The word in capitals that stands for the keys of a mapping in the guide, such as STRUT."""
+
+    word: str
+
+
+StrutKey = Annotated[str, KeyName("STRUT")]
+
+
 class OneOf:
     """Reads one of several kinds of settings, selected by the value of one key."""
 
@@ -80,13 +92,14 @@ class HeightSignal(MeasuredSignal):
     """Where a height stands on the bus, and its delay.
 
     Attributes:
-        message: Message of the DBC.
-        signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that shows whether the sensor measures.
+        zero: A reading at a known length of the strut; if absent, the reading is the length.
+        reversed: True if the reading falls while the height grows; requires `zero`.
         delay_s: Time from the instant that the value describes to the arrival of its frame, because
             of the sensor's filter, its cycle and the bus. The value is compared with the model's
             height at that instant.
     """
+
+    refused_keys: ClassVar[frozenset[str]] = frozenset({"tare_n"})
 
     delay_s: Annotated[Finite, Field(ge=0, le=1.0)] = 0.0
 
@@ -100,6 +113,11 @@ class SensorSignal(HeightSignal):
     """A further sensor of a strut: another height, a velocity, or a load cell in the strut.
 
     Attributes:
+        reversed: True if the reading falls while the quantity grows; requires `zero` with
+            `measures: height`.
+        tare_n: Reading without a force, in N after the scaling by the DBC, and before a reversal;
+            0 if absent.
+        delay_s: Time from the instant that the value describes to the arrival of its frame.
         measures: What it measures.
     """
 
@@ -122,6 +140,10 @@ def _noise(quantity: Quantity) -> SensorNoise:
     return quantity.noise
 
 
+_MOUNTING_KEYS = {"zero": Dimension.LENGTH, "tare_n": Dimension.FORCE}
+"""Keys that only sensors of one dimension have."""
+
+
 def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     """Settings of a sensor that measures a quantity of a strut."""
     noise = _noise(quantity)
@@ -129,14 +151,13 @@ def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     fields: dict[str, Any] = {"measures": (Literal[quantity.key], ...), noise.key: (std, ...)}
     name = f"{quantity.key.capitalize()}Sensor"
     settings = create_model(name, __base__=SensorSignal, __module__=__name__, **fields)
+    settings.refused_keys = frozenset(
+        key for key, dimension in _MOUNTING_KEYS.items() if quantity.dimension is not dimension
+    )
     choices = ", ".join(f"`{key}`" for key in STRUT_QUANTITIES)
     settings.__doc__ = f"""{quantity.words[0].upper()}{quantity.words[1:]}.
 
     Attributes:
-        message: Message of the DBC.
-        signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that shows whether the sensor measures.
-        delay_s: Time from the measurement to the arrival of its frame.
         measures: Measured quantity of the strut: {choices}.
         {noise.key}: Standard deviation of a reading, quantisation included.
     """
@@ -155,16 +176,22 @@ class Signals(_Frozen):
     Attributes:
         height: Measured height of each strut, by strut name.
         further: Further sensors of a strut, by the names of strut and sensor.
+        QUANTITY: A quantity that the bench measures once, such as `applied_force`, by its key in
+            the table of measured quantities.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
-    __pydantic_extra__: dict[str, MeasuredSignal | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
+    __pydantic_extra__: dict[Annotated[str, KeyName("QUANTITY")], MeasuredSignal | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
         init=False
     )
 
-    height: Annotated[dict[str, HeightSignal], Field(min_length=1)]
+    height: Annotated[dict[StrutKey, HeightSignal], Field(min_length=1)]
     further: dict[
-        str, dict[SensorName, Annotated[SensorSignal, OneOf("measures", SENSORS, None)]]
+        StrutKey,
+        dict[
+            Annotated[SensorName, KeyName("SENSOR")],
+            Annotated[SensorSignal, OneOf("measures", SENSORS, None)],
+        ],
     ] = Field(default_factory=dict[str, dict[str, SensorSignal]])
 
     @model_validator(mode="before")
@@ -196,7 +223,9 @@ class PrescribedMotion(_Frozen):
     settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = 0.002
 
 
-Mapped = dict[str, SignalName]
+_Observer = Annotated[AnyObserver, OneOf("kind", OBSERVERS, DEFAULT_KIND)]
+
+Mapped = dict[Annotated[str, KeyName("QUANTITY")], SignalName]
 """Signals that publish something, by its key."""
 
 
@@ -284,16 +313,16 @@ class RunConfig(_Frozen):
         rate_hz: Ticks per second.
         duration_s: Length of the run; if absent, it lasts until Ctrl-C.
         model: Model file, relative to the configuration's folder, or the name of a shipped model.
-        engine: Program that simulates the model.
+        engine: Program that simulates the model; only `dart` is supplied.
         dbc: DBC file, relative to the configuration's folder; the package's own if absent.
         bus: Interface, channel and bit rates of the bus.
         authentication: Authentication of all frames; none if absent.
         signals: Signals that are read from the bus.
         devices: Devices that report their state, by the names of their nodes in the DBC.
         prescribed_motion: Declares a dyno: the motion is prescribed, a load cell is required, and
-            an applied force is not permitted.
+            an applied force and further sensors are not permitted.
         observers: Observer of each strut, by strut name; `pi` for a strut without an entry. A dyno
-            uses no observer. The keys of each kind are listed below.
+            uses no observer. The tables below list the keys of each kind.
         publish: Signals that carry the quantities of each strut, by strut name and by the keys of
             the published quantities. By default RIG_ESTIMATE and RIG_KINEMATICS, if the DBC has
             them, for the first strut, and these names with _2, _3, ... for the next ones.
@@ -316,12 +345,12 @@ class RunConfig(_Frozen):
     bus: BusConfig = BusConfig()
     authentication: AuthenticationSettings | None = None
     signals: Signals
-    devices: dict[SensorName, DeviceSettings] = Field(default_factory=dict[str, DeviceSettings])
-    prescribed_motion: PrescribedMotion | None = None
-    observers: dict[str, Annotated[AnyObserver, OneOf("kind", OBSERVERS, DEFAULT_KIND)]] = Field(
-        default_factory=dict
+    devices: dict[Annotated[SensorName, KeyName("NODE")], DeviceSettings] = Field(
+        default_factory=dict[str, DeviceSettings]
     )
-    publish: dict[str, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
+    prescribed_motion: PrescribedMotion | None = None
+    observers: dict[StrutKey, _Observer] = Field(default_factory=dict)
+    publish: dict[StrutKey, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
     status: Annotated[Mapped, BeforeValidator(_mapping(STATUS))] | None = None
     timing: Annotated[Mapped, BeforeValidator(_mapping(TIMING))] | None = None
     supervision: Supervision = Supervision()

@@ -96,8 +96,8 @@ class BenchStrut(_Section):
         between: Lower and upper body. Every body is the upper body of exactly one strut.
         free_length_m: Height at which the deflection in the laws of undeclared effects is zero, in
             m.
-        spring: Spring curve.
-        damper: Damper curve.
+        spring: Spring curve, by points: monotone cubic between them, straight beyond.
+        damper: Damper curve, by points: monotone cubic between them, straight beyond.
         initial_height_m: Height at the start in m; the static equilibrium if absent.
     """
 
@@ -113,7 +113,7 @@ class _Sine(_Section):
     """A sine: amplitude * sin(angular frequency * t + phase_rad).
 
     Attributes:
-        kind: `sine`: a sine.
+        kind: `sine`: amplitude * sin(angular frequency * t + phase).
         frequency_hz: Frequency in Hz; either this or `angular_frequency_rad_per_s` is required.
         angular_frequency_rad_per_s: Angular frequency in rad/s, instead of `frequency_hz`.
         phase_rad: Phase at time zero in rad.
@@ -162,7 +162,7 @@ class _Multisine(_Section):
     """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
 
     Attributes:
-        kind: `multisine`: sines of equal amplitude on equally spaced frequencies.
+        kind: `multisine`: sines of equal amplitude and random phase on equally spaced frequencies.
         low_hz: Lowest frequency in Hz.
         high_hz: Highest frequency in Hz.
         lines: Number of frequencies.
@@ -224,6 +224,7 @@ class Sweep(_Sweep):
     """A swept force; zero after `duration_s`.
 
     Attributes:
+        kind: `sweep`: a sine whose frequency changes; zero after `duration_s`.
         amplitude_n: Amplitude in N.
     """
 
@@ -234,6 +235,7 @@ class HeightSweep(_Sweep):
     """A swept motion; it stays where it ends.
 
     Attributes:
+        kind: `sweep`: a sine whose frequency changes; constant after `duration_s`.
         amplitude_m: Amplitude in m.
     """
 
@@ -269,7 +271,8 @@ class ForceFile(_File):
     """A force from column `applied_force_n`, straight between samples, zero outside them.
 
     Attributes:
-        path: CSV file in the configuration's folder, with `t_s` and `applied_force_n`.
+        kind: `file`: a column of a CSV file, linear between samples, zero outside them.
+        path: CSV file in the configuration's folder, with the columns `t_s` and `applied_force_n`.
     """
 
     column = "applied_force_n"
@@ -279,7 +282,8 @@ class HeightFile(_File):
     """A motion from column `height_m`, a cubic spline between samples, still outside them.
 
     Attributes:
-        path: CSV file in the configuration's folder, with `t_s` and `height_m`.
+        kind: `file`: a column of a CSV file, a cubic spline between samples, constant outside them.
+        path: CSV file in the configuration's folder, with the columns `t_s` and `height_m`.
     """
 
     column = "height_m"
@@ -446,7 +450,7 @@ class Transmission(_Section):
         latency_ns: Time from sample to transmission in ns.
         jitter_ns: Largest additional delay in ns; the delay is uniformly distributed from zero to
             this value.
-        loss_probability: Probability that a frame is lost; the counter shows the gap.
+        loss_probability: Probability that a frame is lost; the message's counter then shows it.
         height: Height sensor, if the message carries one.
         applied_force: Sensor of the applied force, if the message carries one.
         strut_force: Load cell, if the message carries one.
@@ -486,8 +490,9 @@ class BenchConfig(_Section):
         masses: Bodies.
         struts: Struts. Each carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any.
-        prescribed_motion: The motion that drives a strut, if any.
-        temperature: Temperature of the damper.
+        prescribed_motion: The motion that drives a strut, if any (a dyno).
+        temperature: Temperature of the damper: the power that its curve dissipates heats it, and
+            the air cools it.
         undeclared_effects: Effects of the bench that the bridge's model does not contain.
         transmissions: Messages that the bench sends.
         seed: Seed of the random numbers for noise, jitter and loss.

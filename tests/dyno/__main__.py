@@ -75,6 +75,7 @@ def write_page(hits, cases):
         TEXT.format(cases=cases, laws=", ".join(laws)),
         [table(("figure", "all", *laws), rows)],
         command_line(),
+        with_load=False,
     )
 
 

@@ -294,6 +294,7 @@ def write_page(found: Mapping[str, Counter[str]]) -> None:
         TEXT.format(scatter=100 * SCATTER),
         [table(heads, [row_of(*item) for item in found.items()])],
         command_line(),
+        with_load=False,
     )
 
 

@@ -71,7 +71,7 @@ def main() -> int:
         write_evidence(
             "faults", "Measured reactions to faults", FAULTS_TEXT, [faults], command_line()
         )
-        write_evidence("promise", title, PROMISE_TEXT, [promise], command_line())
+        write_evidence("promise", title, PROMISE_TEXT, [promise], command_line(), with_load=False)
     return code
 
 

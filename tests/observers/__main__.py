@@ -372,7 +372,9 @@ def main():
     if given.only in (None, "grid"):
         parts += grid_part(grid(given.jobs, given.one_of))
     if given.page:
-        write_evidence("observers", "Errors of the observers", TEXT, parts, command_line())
+        write_evidence(
+            "observers", "Errors of the observers", TEXT, parts, command_line(), with_load=False
+        )
 
 
 if __name__ == "__main__":

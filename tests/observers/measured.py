@@ -159,7 +159,7 @@ def main():
         kinds = ("published gains", "tuned PI", "noise-aware", "smoothed after the run")
         title = "The observers on measured data"
         found = table((*heads, *kinds), rows)
-        write_evidence("observers-measured", title, TEXT, [found], command_line())
+        write_evidence("observers-measured", title, TEXT, [found], command_line(), with_load=False)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,17 @@ from tests.scoreboard.run import run_scoreboard
 from tests.scoreboard.table import page
 
 TEXT = """
-Published data of measured benches are diagnosed with `rig diagnose`, from a rough start model or
-from the published parameters. Laws and parameters are determined from the training data; the test
-data take no part in the search and the fit; they can only cause a law to be removed afterwards.
+Published data of measured benches are diagnosed with `rig diagnose`, from a start model; the last
+column states where its parameters are from. Laws and parameters are searched for and fitted on the
+training data. The test data decide two things afterwards. If all data are described as well without
+the laws, these are removed. With the verdict `not_explained`, the model with the least error on the
+test data is taken, so that this error is slightly optimistic.
 
-Each table contains one data set, with one row per model and one column per test. The models called
+A table contains one data set, with one row per model and one column per test. The models called
 `rig` were computed here; the others are published figures from the source in the last column.
+
+EMPS is an electro-mechanical positioning stage without a spring (Janot, Gautier, Brunot 2019). Its
+recordings `train` and `pulses` are each used once for training and once for the test.
 """
 
 

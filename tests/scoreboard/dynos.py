@@ -107,7 +107,7 @@ def _split_rows(dataset: str, split: _Split, folder: Path, progress: Progress) -
     try:
         result = diagnose_runs(runs, model, tests, folder, progress)
     except RecordingError as error:
-        why = f"computed here; training data {learnt}; refused: {error}"
+        why = f"computed here, trained on `{learnt}`; refused: {error}"
         return [Row(dataset, test, CORRECTED, None, _UNIT, why) for test in split.tests]
     write_report(result, folder / "report.html")
     sizes: list[float] = []
@@ -119,9 +119,9 @@ def _split_rows(dataset: str, split: _Split, folder: Path, progress: Progress) -
             sizes.append(float(np.std(force)))
             before.append(error.before)
             after.append(error.after)
-    how = f"computed here; training data {learnt}; {findings(result.diagnosis)}"
+    how = f"computed here, trained on `{learnt}`; {findings(result.diagnosis)}"
     sources = {
-        _LINEAR: (before, f"computed here; least squares, training data {learnt}"),
+        _LINEAR: (before, f"computed here, least squares on `{learnt}`"),
         CORRECTED: (after, how),
     }
     rows: list[Row] = []

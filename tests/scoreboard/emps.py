@@ -16,7 +16,7 @@ from rig.recordings.recording import RecordingError
 from tests.scoreboard.starts import one_body
 from tests.scoreboard.table import CORRECTED, START, Row, findings
 
-_NAME, _UNIT = "EMPS", "RMSE in mm"
+_NAME, _UNIT = "EMPS", "RMSE of the position in free-run simulation, mm"
 _RUNS = ("train", "pulses")
 _MIDDLE_M = 0.5
 """Offset of the heights; without a spring any free length would do."""
@@ -40,13 +40,13 @@ def emps_rows(data_folder: Path | None, out: Path, progress: Progress) -> list[R
         try:
             result = diagnose_runs([files[learnt]], model, [files[test]], folder, share)
         except RecordingError as error:
-            why = f"computed here; training data {learnt}; refused: {error}"
+            why = f"computed here, trained on `{learnt}`; refused: {error}"
             rows.append(Row(_NAME, test, CORRECTED, None, _UNIT, why))
             continue
         write_report(result, folder / "report.html")
         error = result.diagnosis.held_out.height_rmse_m
         start = "computed here; start model with published mass and damping, no friction"
         rows.append(Row(_NAME, test, START, _MM_PER_M * error.before, _UNIT, start))
-        how = f"computed here; training data {learnt}; {findings(result.diagnosis)}"
+        how = f"computed here, trained on `{learnt}`; {findings(result.diagnosis)}"
         rows.append(Row(_NAME, test, CORRECTED, _MM_PER_M * error.after, _UNIT, how))
     return rows

@@ -8,7 +8,7 @@ from pathlib import Path
 from rig.diagnosis.outcome import Diagnosis
 
 TABLE_FILE, PAGE_FILE = "scoreboard.csv", "scoreboard.md"
-START, CORRECTED = "rig, rough start", "rig, corrected"
+START, CORRECTED = "rig, start model", "rig, corrected"
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,7 @@ def test_each_damper_record_is_told_from_the_others_of_its_current(tmp_path: Pat
         for test in ("1mm1Hz1A", "2mm1Hz1A")
         for model in ("rig, spring and damper", "rig, corrected")
     ]
-    assert "training data 2mm1Hz1A; nothing missing" in rows[1].source
+    assert "trained on `2mm1Hz1A`; nothing missing" in rows[1].source
     size = float(np.std(record.strut_forces_n))
     for row in rows:
         assert row.value is not None
