@@ -319,9 +319,13 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
         if not signal.unit and not signal.is_float and signal.length_bits <= 2
         if _has_word(signal, _VALID_WORDS) or _has_word(signal, _FAULT_WORDS)
     ]
-    # The signal's own, or one that belongs to no other signal.
+    # The signal's own, or one that belongs to no other signal; a counter is of the whole message.
     own = [item for item in flags if _shares_a_word(item.name, measured.name)]
-    others = [item.name for item in message.signals.values() if item not in (*flags, measured)]
+    others = [
+        item.name
+        for item in message.signals.values()
+        if item not in (*flags, measured) and not _is_counter(message, item)
+    ]
     common = [it for it in flags if not any(_shares_a_word(it.name, other) for other in others)]
     chosen = own or common
     if len(chosen) != 1:

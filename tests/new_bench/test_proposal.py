@@ -193,6 +193,7 @@ FLAGS = (
     [
         ("TravelOk", "", 1),
         ("TravelFault", "", 0),
+        ("AliveOk", "", 1),
         ("TravelQual", 'VAL_ 288 TravelQual 0 "ok" 1 "broken" ;\n', 0),
     ],
 )
