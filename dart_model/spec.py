@@ -355,7 +355,7 @@ class ModelSpec(_Frozen):
 
 
 def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
-    """Model from YAML text as documented in the README; its files are looked for in `folder`.
+    """Model from YAML text as the guide documents it; its files are looked for in `folder`.
 
     Raises:
         ModelError: One line that names file, key, value and what was expected.

@@ -1,12 +1,13 @@
 """`rig evaluate`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.terminal import JsonFlag, print_json, print_table, print_text
 
 if TYPE_CHECKING:
@@ -39,18 +40,31 @@ def evaluate_command(
     from dart_model.spec import load_named_model
     from rig.diagnosis.evaluate import evaluate_model
     from rig.recordings.read import read_recording
+    from rig.recordings.recording import RecordingError
 
     specs = [load_named_model(name, Path()) for name in model]
     rows: list[tuple[str, RunEvaluation]] = []
     gaps: dict[str, Gaps] = {}
+    failed: list[str] = []
     for name, spec in zip(model, specs, strict=True):
         struts = [strut.name for strut in spec.struts]
         recordings = [read_recording(path, struts) for path in runs]
         gaps = {item.name: item.force_gaps for item in recordings if item.force_gaps is not None}
-        rows += [(name, evaluation) for evaluation in evaluate_model(spec, recordings)]
+        for recording in recordings:
+            try:
+                rows += [(name, it) for it in evaluate_model(spec, [recording])]
+            except RecordingError as error:  # the others are evaluated all the same
+                failed.append(f"{name}: {error}")
     if as_json:
-        print_json({"schema": 1, "evaluations": [_as_dict(*row, gaps) for row in rows]})
-        return
+        evaluations = [_as_dict(*row, gaps) for row in rows]
+        print_json({"schema": 1, "evaluations": evaluations, "failed": failed})
+    else:
+        _print(rows, gaps)
+    if failed:
+        raise InputError("; ".join(failed))
+
+
+def _print(rows: "Sequence[tuple[str, RunEvaluation]]", gaps: "Mapping[str, Gaps]") -> None:
     for run in dict.fromkeys(row.figures.run for _, row in rows):
         _print_run(run, [row for row in rows if row[1].figures.run == run])
         if run in gaps:

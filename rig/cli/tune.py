@@ -137,6 +137,7 @@ def tune_command(
     plan, aim = load_plan(config, model=model), Aim(damping_ratio, gain_margin, settling_s)
     with progress_bar() as bar:
         struts = tune(plan, source, observer, aim, bar)
+    _refuse_limits(plan, struts)
     if out is not None:
         write_config(plan, struts, out, model)
     if plot is not None:
@@ -274,6 +275,20 @@ def _print_errors(strut: "TunedStrut") -> None:
             "observer then only guards against a change of the bench; with a longer --settling-s "
             "it adds less noise to the force."
         )
+
+
+def _refuse_limits(plan: "Plan", struts: "list[TunedStrut]") -> None:
+    """Refuse observers that do not know what a limit of the configuration requires."""
+    from rig.bridge.supervision_limits import LimitedValue
+
+    without = [it.name for it in struts if not it.tuned.observer.knows_std]
+    for row in plan.config.supervision.limits:
+        concerned = without if row.strut is None else {row.strut}.intersection(without)
+        if row.value is LimitedValue.FORCE_STD_N and concerned:
+            raise InputError(
+                f"{plan.source}: supervision.limits has force_std_n, which an observer of this "
+                "kind does not state: expected --observer kalman, or no such row"
+            )
 
 
 def _propose_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None:

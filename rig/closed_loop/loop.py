@@ -1,7 +1,8 @@
 """Model and observers in closed loop, made linear by differences on the step itself.
 
-The map from one measurement to the next is differenced about a bench at rest; the model is known by
-its responses alone.
+The map from one measurement to the next is differenced about a slow motion of the bench, in both
+directions: friction is infinitely steep at rest, and so is a damper's force that grows with a power
+of the speed below one. The model is known by its responses alone.
 
 Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapter 3.
 """
@@ -27,6 +28,10 @@ limit."""
 
 _ACCELERATION_STEP_M_PER_S2 = 1e-2
 """Step of the residual force, over the effective mass."""
+
+
+_SPEED_M_PER_S = 0.1
+"""Of that motion: a share of a usual speed, as for the secants of a strut's response."""
 
 
 class SampleTiming(NamedTuple):
@@ -132,7 +137,12 @@ class Loop:
         """Numbers of model, observers and the model's past heights (the newest first), at rest."""
 
     def after(
-        self, x: Array, strut: int = 0, noise_m: float = 0.0, residual_n: float = 0.0
+        self,
+        x: Array,
+        strut: int = 0,
+        noise_m: float = 0.0,
+        residual_n: float = 0.0,
+        bench_m: Sequence[float] | None = None,
     ) -> tuple[Array, float]:
         """Numbers after the next measurement, and the error of a strut's published force.
 
@@ -142,7 +152,9 @@ class Loop:
             noise_m: Noise of the measurement.
             residual_n: Force that the bench's strut has and the model's lacks, over the interval;
                 the bench's motion is taken as given, and the model gets the force's opposite.
+            bench_m: Heights of the bench when the measurement was true; at rest if absent.
         """
+        measured_m = self._heights_m if bench_m is None else bench_m
         parts = [x[first:end].tolist() for first, end in itertools.pairwise(self._ends)]
         model = self._plant.state_of(parts[0])
         states = [
@@ -169,7 +181,7 @@ class Loop:
                         bench_m - model_m + (noise_m if index == strut else 0.0), measured_ns
                     )
                     for index, (bench_m, model_m) in enumerate(
-                        zip(self._heights_m, compared, strict=True)
+                        zip(measured_m, compared, strict=True)
                     )
                 ]
                 seen = (now + seen)[: count * timing.delay]
@@ -187,18 +199,45 @@ class Loop:
         return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
 
     def linear(self, strut: int = 0) -> LinearLoop:
-        """The loop about rest, as one strut's noise and residual force drive it."""
+        """The loop about a slow motion, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
         step_n = _ACCELERATION_STEP_M_PER_S2 / self._responses[strut].mobility_per_kg
 
-        def after(u: Array) -> Array:
-            noise_m, residual_n = u[size:].tolist()
-            return np.append(*self.after(self.at_rest + u[:size], strut, noise_m, residual_n))
+        def slopes_at(speed_m_per_s: float) -> Array:
+            moving, bench_m = self._moving(speed_m_per_s)
 
-        slopes = central_differences(after, [*widths, _STEP, step_n])
+            def after(u: Array) -> Array:
+                noise_m, residual_n = u[size:].tolist()
+                return np.append(
+                    *self.after(moving + u[:size], strut, noise_m, residual_n, bench_m)
+                )
+
+            return central_differences(after, [*widths, _STEP, step_n])
+
+        slopes = 0.5 * (slopes_at(_SPEED_M_PER_S) + slopes_at(-_SPEED_M_PER_S))
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
+
+    def _moving(self, speed_m_per_s: float) -> tuple[Array, list[float]]:
+        """Numbers of a model that has followed a motion, and the bench's heights then measured."""
+        timing, count = self._timing, len(self._heights_m)
+        model = self._plant.init(self._heights_m, [speed_m_per_s] * count)
+        travel_m = speed_m_per_s * timing.interval_ns * 1e-9
+        past_m = [
+            height_m - number * travel_m
+            for number in range(timing.delay)
+            for height_m in self._heights_m
+        ]
+        moving = self.at_rest.copy()
+        moving[: self._ends[1]] = self._plant.numbers(model)
+        moving[self._ends[-2] :] = past_m
+        if timing.delay:
+            return moving, past_m[-count:]
+        for _ in range(timing.measured_every):
+            loaded = self._plant.load(model, [0.0] * count, 0.0, AMBIENT_C)
+            model = self._plant.step(loaded, timing.period_ns * 1e-9, 0.0)
+        return moving, [height_m for height_m, _ in model.struts]
 
     def _steady_state(self, observer: Observer[StateT], response: StrutResponse) -> StateT:
         """An observer that has followed a bench at rest for long, its last tick at time zero."""

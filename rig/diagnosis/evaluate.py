@@ -55,9 +55,10 @@ def fit_as_given(problem: Problem) -> Fit:
     none_free = np.zeros(len(problem.linear), dtype=np.bool_)
     given = fit(problem, first, none_free, Effort(8), effects=False)
     if given is None:
+        names = ", ".join(dict.fromkeys(grid.name for grid in problem.grids))
         raise RecordingError(
-            f"model {problem.spec.name}: runs away on the recordings, expected one that stays "
-            "near them: check its stiffness, its free length and the sign of the applied force"
+            f"model {problem.spec.name}: runs away on {names}, expected a model that stays near "
+            "it: check its stiffness, its free length and the sign of the applied force"
         )
     return given
 

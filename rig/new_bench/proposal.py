@@ -5,6 +5,7 @@ signal that marks the estimate as invalid, and limits on what a height sensor ca
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -43,6 +44,7 @@ _LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
 """Rates of the bridge: that of the height where it lies between, else the usual one."""
 
 _VALID_WORDS, _OK_CHOICES = ("valid", "gueltig", "qual", "ok"), ("ok", "valid", "good", "gueltig")
+_WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
 _COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount")
 _STATE_WORDS = ("state", "mode", "status", "zustand")
@@ -317,7 +319,9 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
         signal
         for signal in message.signals.values()
         if not signal.unit and not signal.is_float and signal.length_bits <= 2
-        if _has_word(signal, _VALID_WORDS) or _has_word(signal, _FAULT_WORDS)
+        if _has_word(signal, _VALID_WORDS)
+        or _is_described_as_valid(signal)
+        or _has_word(signal, _FAULT_WORDS)
     ]
     # The signal's own, or one that belongs to no other signal; a counter is of the whole message.
     own = [item for item in flags if _shares_a_word(item.name, measured.name)]
@@ -335,6 +339,14 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
         if any(text.lower().startswith(word) for word in _OK_CHOICES):
             return flag.name, raw
     return flag.name, 0 if _has_word(flag, _FAULT_WORDS) else 1
+
+
+def _is_described_as_valid(signal: Signal) -> bool:
+    """Whether a comment says that 1 is the value of a sensor that works."""
+    return (
+        re.match(rf"1\s*[:=]?\s*(?:sensor\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
+        is not None
+    )
 
 
 def _shares_a_word(one: str, other: str) -> bool:

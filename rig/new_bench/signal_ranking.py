@@ -225,7 +225,10 @@ def _range_score(message: Message, signal: Signal, likeness: Likeness) -> _Score
     (least, most), (_, possible) = likeness.spans
     if least <= span <= most:
         return 1.0, f"range {signal.minimum:g} to {signal.maximum:g} {signal.unit}"
-    return (-3.0 if span > possible else 0.0), ""
+    # A range that is that of the bits says nothing of the sensor.
+    step = si_step(message, signal.name, likeness.dimension)
+    is_of_bits = span >= 0.99 * step * (2**signal.length_bits - 1)
+    return (-3.0 if span > possible and not is_of_bits else 0.0), ""
 
 
 def _step_score(message: Message, signal: Signal, likeness: Likeness) -> _Scored:

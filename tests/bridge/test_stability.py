@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 
 from dart_model.plant import DartPlant
-from dart_model.spec import MODELS, load_model, parse_model
+from dart_model.spec import MODELS, dump_model, load_model, parse_model
 from rig.bridge.mode_supervisor import Supervision
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import Pole, closed_loop_poles
@@ -127,3 +128,42 @@ def test_the_memory_of_effects_has_poles_too():
     # The branch relaxes in 20 ms, a little faster for the mass that it drives: a real, fast pole.
     fast = min(pole.magnitude for pole in found)
     assert 0.9 < fast < 0.97
+
+
+def with_effects(*effects: dict[str, object]) -> DartPlant:
+    spec = load_model(MODELS / "reference.yaml")
+    content = yaml.safe_load(dump_model(spec))
+    content["struts"][0]["effects"] = list(effects)
+    return DartPlant(parse_model(yaml.safe_dump(content), "with effects"))
+
+
+COULOMB = {
+    "name": "coulomb_friction",
+    "parameters": {"coulomb_force_n": 40.0, "rounding_velocity_m_per_s": 0.003},
+}
+ROOT = {
+    "name": "power_damping",
+    "parameters": {"force_at_1_m_per_s_n": 100.0, "exponent": 0.5},
+}
+
+
+@pytest.mark.parametrize(("every", "delay"), [(1, 0), (2, 0), (1, 3)])
+def test_friction_which_is_steep_at_rest_leaves_the_poles_of_motion(every: int, delay: int) -> None:
+    timing = SampleTiming(MS, every, delay)
+    observer = (gains(2e4, 1e4, 5000.0),)
+    plain = closed_loop_poles(with_effects(), observer, (REST_M,), timing)
+    rubbing = closed_loop_poles(with_effects(COULOMB), observer, (REST_M,), timing)
+    expected, found = ([pole.magnitude for pole in poles] for poles in (plain, rubbing))
+    assert found == pytest.approx(expected, abs=2e-4)
+
+
+def test_a_root_of_the_speed_damps_as_its_slope_in_motion() -> None:
+    """At 0.1 m/s the slope of 100 N sqrt(v) is 158 N s/m."""
+    timing, observer = SampleTiming(MS), (gains(2e4, 1e4, 5000.0),)
+    linear = {"name": "linear_damping", "parameters": {"damping_n_s_per_m": 50.0 / 0.1**0.5}}
+    root, slope = (
+        closed_loop_poles(with_effects(effect), observer, (REST_M,), timing)
+        for effect in (ROOT, linear)
+    )
+    expected = [pole.magnitude for pole in slope]
+    assert [pole.magnitude for pole in root] == pytest.approx(expected, abs=1e-3)

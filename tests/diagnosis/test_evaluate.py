@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -174,3 +175,22 @@ def test_of_a_burst_of_frames_the_last_one_is_timed():
     timed = are_timed(arrivals_ns)
     assert np.array_equal(np.flatnonzero(~timed), np.arange(50, 55))
     assert np.all(are_timed(regular_ns + np.random.default_rng(1).integers(0, 900_000, 100)))
+
+
+def test_a_model_that_runs_away_leaves_the_others_evaluated(tmp_path):
+    run = little_bench.run(little_bench.Nothing(), duration_s=6.0)
+    table = np.column_stack([run.t_s, run.heights_m[:, 0], run.applied_force_n])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9g", ",", header="t_s,height_m,applied_force_n", comments="")
+    right = little_bench.model()
+    (tmp_path / "right.yaml").write_text(dump_model(right))
+    content = yaml.safe_load(dump_model(right))
+    pushing = {"name": "linear_damping", "parameters": {"damping_n_s_per_m": -900.0}}
+    content["struts"][0]["effects"] = [pushing]
+    (tmp_path / "away.yaml").write_text(yaml.safe_dump(content))
+    models = ["--model", str(tmp_path / "away.yaml"), "--model", str(tmp_path / "right.yaml")]
+    found = CliRunner().invoke(app, ["evaluate", str(path), *models])
+    assert "Free-run simulation of run.csv" in found.output
+    assert isinstance(found.exception, InputError)
+    assert "away.yaml: model" in str(found.exception)
+    assert "runs away on run.csv" in str(found.exception)

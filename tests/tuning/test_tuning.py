@@ -207,3 +207,15 @@ def test_what_is_wrong_is_said_in_one_line(late, monkeypatch, capsys, asked, say
 def test_a_tuned_run_is_replayed_bit_by_bit(late):
     assert replay(late / "run").different == 0
     assert plan_of_run(late / "run").config.observers["strut"].kind == "kalman"
+
+
+def test_an_observer_that_states_no_deviation_does_not_suit_such_a_limit(late, monkeypatch, capsys):
+    text = (late / "rig.yaml").read_text()
+    limit = "supervision: {limits: [{value: force_std_n, high: 100, action: hold}]}"
+    assert "supervision" not in text
+    path = late / "limited.yaml"
+    path.write_text(text.replace("kind: pi", "kind: kalman") + limit + "\n")
+    asked = ("tune", path, "--residual-n", 60, "--up-to-hz", 5, "--observer", "pi")
+    assert rig(monkeypatch, *asked, "--out", late / "other.yaml") == 2
+    assert "expected --observer kalman, or no such row" in capsys.readouterr().err
+    assert not (late / "other.yaml").exists()
