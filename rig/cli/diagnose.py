@@ -73,5 +73,5 @@ def diagnose(
         print_text(
             f"Next: `rig run CONFIG --model {out}/corrected.yaml --listen-only --duration-s 20 "
             f"--out second`, then `rig tune CONFIG --model {out}/corrected.yaml --run second "
-            "--out corrected.yaml`: the old gains suit the old model"
+            "--out tuned-corrected.yaml`: the old gains suit the old model"
         )

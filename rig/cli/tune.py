@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
     "`rig tune rig.yaml --residual-n 80 --up-to-hz 5 --observer pi` · after a correction: "
-    "`rig tune rig.yaml --model found/corrected.yaml --run second --out corrected.yaml`"
+    "`rig tune rig.yaml --model found/corrected.yaml --run second --out tuned-corrected.yaml`"
 )
 
 
