@@ -38,27 +38,52 @@ is named there is counted apart."""
 TEXT = f"""
 Recordings are simulated on benches with known truth, by a generator with its own equations of
 motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno; the
-nominal model is exact (apart from these effects) or rough. The whole benchmark also contains
-formulas that are not in the catalogue (`foreign`) and forces that no law describes (`outside`); the
-table contains the groups that were run.
+nominal model is exact (apart from these effects) or rough.
+
+The names of the groups: `single`, `pair` and `triple` have one, two and three planted effects,
+`complete` none. `foreign` has formulas that are not in the catalogue, `outside` forces that no law
+describes. `rough` (alone: with one effect) has a rough nominal model. `dyno` (alone: with one
+effect) is on a dyno; there, about half of the cases have a rough nominal model, unless the planted
+effect is linear. With a rough nominal model and no planted effect, `explained` is right, because
+linear corrections explain the data. The rows in italics combine several groups.
+
+{{groups}} The command at the end of the page contains the share of each group that was run
+(`--one-of`).
 
 A case counts as right if
 
-- `rig diagnose` names the planted families as missing (if only one effect is planted: names it
-  first),
-- or a partial or ambiguous result contains them,
-- or nothing is planted, and at most linear corrections of a rough model are named,
+- one effect is planted, the verdict is `explained` or `partly_explained`, and `rig diagnose` names
+  the family of the effect first (a preload that accompanies a stiffness is not counted before it;
+  with a rough nominal model, the first family that is not linear counts),
+- or several effects are planted, the verdict is one of these, and all of their families are named,
+  as effects or as linear corrections,
+- or the verdict is `ambiguous`, and the planted families are named in this way or listed as rivals,
+- or nothing is planted, and the verdict is `nothing_missing`, or, with a rough nominal model, at
+  most linear corrections are named and the verdict is not `not_explained`,
 - or no law describes the planted force, and the result claims neither that laws explain it nor that
   nothing is missing.
 
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
-*False names* is the share of cases in which an effect is named that was not planted; *not bound* is
-the share of cases in which the data do not exclude that a named effect has the size zero. Shares
-are given with their 95 % interval after Wilson. A group that ends with `complete` has no planted
-effect; one that begins with `rough` has a rough nominal model. The rows in italics combine several
-groups.
+*False names* is the share of cases in which a family is named that was not planted, with at least
+one parameter that the data bound; *not bound* is the share of cases in which the data do not
+exclude that a named effect has the size zero. Shares are given with their 95 % interval after
+Wilson. The intervals of parameters are counted only in cases that are right. A case has several of
+them; the Wilson interval of their share assumes that they are independent, and is too narrow. The
+durations depend on the load of the machine, which is stated at the end of the page.
 """
+
+
+def _groups_text(run: Iterable[str]) -> str:
+    """A sentence about the groups that the table contains."""
+    usual = [name for name, group in GROUPS.items() if group.cases]
+    absent = [name for name in usual if name not in set(run)]
+    if not absent:
+        return f"The table contains all {len(usual)} groups of the benchmark."
+    names = ", ".join(f"`{name}`" for name in absent)
+    number = len(usual) - len(absent)
+    contained = f"The table contains {number} of the {len(usual)} groups of the benchmark."
+    return f"{contained} Not run: {names}."
 
 
 class Rate(NamedTuple):
@@ -245,7 +270,7 @@ def write_page(summary: dict) -> None:
     write_evidence(
         "diagnosis",
         "How often a diagnosis is right",
-        TEXT,
+        TEXT.format(groups=_groups_text(summary["groups"])),
         [markdown(summary).strip(), wrong if rows else "No case was wrong."],
         command_line(),
     )

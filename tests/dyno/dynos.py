@@ -87,7 +87,9 @@ class Dyno(NamedTuple):
             "spring rate": rate,
             "mean force": float(0.5 * (law(0.0, -v) + law(0.0, v))),
             "half difference": float(0.5 * (law(0.0, -v) - law(0.0, v))),
-            "hysteresis at zero": float(np.mean(law(ends, -small) - law(ends, small))),
+            "hysteresis at the turning points": float(
+                np.mean(law(ends, -small) - law(ends, small))
+            ),
         }
 
 
@@ -104,7 +106,7 @@ def found(step):
         "spring rate": step.spring_rate_n_per_m,
         "mean force": step.mean_force_n,
         "half difference": step.half_difference_n,
-        "hysteresis at zero": step.hysteresis_at_zero_n,
+        "hysteresis at the turning points": step.hysteresis_at_zero_n,
     }
 
 
