@@ -279,12 +279,11 @@ def _print_errors(strut: "TunedStrut") -> None:
 
 def _refuse_limits(plan: "Plan", struts: "list[TunedStrut]") -> None:
     """Refuse observers that do not know what a limit of the configuration requires."""
-    from rig.bridge.supervision_limits import LimitedValue
+    from rig.plan.limits import struts_without_std
 
     without = [it.name for it in struts if not it.tuned.observer.knows_std]
     for row in plan.config.supervision.limits:
-        concerned = without if row.strut is None else {row.strut}.intersection(without)
-        if row.value is LimitedValue.FORCE_STD_N and concerned:
+        if struts_without_std(row, plan.strut_names, without):
             raise InputError(
                 f"{plan.source}: supervision.limits has force_std_n, which an observer of this "
                 "kind does not state: expected --observer kalman, or no such row"

@@ -17,7 +17,11 @@ from numpy.typing import NDArray
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
-from rig.closed_loop.strut_response import StrutResponse, strut_responses
+from rig.closed_loop.strut_response import (
+    USUAL_SPEED_M_PER_S,
+    StrutResponse,
+    strut_responses,
+)
 from rig.observers.protocol import AnyObserver, Innovation, Observer, Start, StateT
 
 Array = NDArray[np.float64]
@@ -28,10 +32,6 @@ limit."""
 
 _ACCELERATION_STEP_M_PER_S2 = 1e-2
 """Step of the residual force, over the effective mass."""
-
-
-_SPEED_M_PER_S = 0.1
-"""Of that motion: a share of a usual speed, as for the secants of a strut's response."""
 
 
 class SampleTiming(NamedTuple):
@@ -215,7 +215,7 @@ class Loop:
 
             return central_differences(after, [*widths, _STEP, step_n])
 
-        slopes = 0.5 * (slopes_at(_SPEED_M_PER_S) + slopes_at(-_SPEED_M_PER_S))
+        slopes = 0.5 * (slopes_at(USUAL_SPEED_M_PER_S) + slopes_at(-USUAL_SPEED_M_PER_S))
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
 

@@ -10,7 +10,7 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 
-_SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1
+_SECANT_M, USUAL_SPEED_M_PER_S = 2e-3, 0.1
 """Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
 steep at rest, counts as it acts in motion."""
 
@@ -45,6 +45,6 @@ def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int)
         return np.array([loaded.accelerations_m_per_s2[index]])
 
     ((mobility, stiffness, damping),) = central_differences(
-        acceleration, (_SECANT_N, _SECANT_M, _SECANT_M_PER_S)
+        acceleration, (_SECANT_N, _SECANT_M, USUAL_SPEED_M_PER_S)
     ).tolist()
     return StrutResponse(mobility, -stiffness, -damping)

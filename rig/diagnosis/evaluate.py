@@ -23,6 +23,8 @@ from rig.diagnosis.problem.problem import (
     first_starts,
     nominal,
     nominal_model,
+    quadratic_mean,
+    quadratic_means,
     select_nodes,
 )
 from rig.diagnosis.search.criteria import CRITERIA
@@ -97,10 +99,10 @@ def _join(nodes: Sequence[int], pieces: Sequence[RunEvaluation]) -> RunEvaluatio
         return pieces[0]
 
     def mean(values: Sequence[float]) -> float:
-        return float(np.sqrt(np.average(np.square(values), weights=nodes)))
+        return quadratic_mean(values, nodes)
 
     def both(pairs: Sequence[BeforeAfter]) -> BeforeAfter:
-        return BeforeAfter(mean([it.before for it in pairs]), mean([it.after for it in pairs]))
+        return quadratic_means(pairs, nodes)
 
     figures = [piece.figures for piece in pieces]
     cells = [it.strut_force_rmse_n for it in figures if it.strut_force_rmse_n is not None]

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
 from rig.diagnosis.outcome import (
-    BeforeAfter,
     Diagnosis,
     Estimate,
     ExistingEffect,
@@ -33,6 +32,7 @@ from rig.diagnosis.problem.problem import (
     StrutEffect,
     mid_stroke_m,
     quadratic_mean,
+    quadratic_means,
     rms,
     slots_of,
 )
@@ -322,18 +322,11 @@ def _suggestion(search: SearchResult) -> str:
 
 def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldOut:
     figures = [run.figures for run in evaluations]
-
-    def mean(pairs: Sequence[BeforeAfter | None]) -> BeforeAfter:
-        known = [pair for pair in pairs if pair is not None]
-        return BeforeAfter(
-            quadratic_mean([p.before for p in known]), quadratic_mean([p.after for p in known])
-        )
-
-    cells = [f.strut_force_rmse_n for f in figures]
+    cells = [f.strut_force_rmse_n for f in figures if f.strut_force_rmse_n is not None]
     return HeldOut(
-        mean([f.height_rmse_m for f in figures]),
-        mean([f.residual_force_rmse_n for f in figures]),
-        mean(cells) if any(cell is not None for cell in cells) else None,
+        quadratic_means([f.height_rmse_m for f in figures]),
+        quadratic_means([f.residual_force_rmse_n for f in figures]),
+        quadratic_means(cells) if cells else None,
         tuple(figures),
         "blocks" if by_blocks else "runs",
     )

@@ -55,8 +55,11 @@ def resolve_limits(
         if row.value is LimitedValue.FORCE_DIFFERENCE_N:
             _check_comparison(row, where, struts, can_compare)
         _check_name(row.strut, struts, f"{where}.strut", "no such strut")
-        if row.value is LimitedValue.FORCE_STD_N:
-            _check_std(row, where, struts, without_std)
+        for strut in struts_without_std(row, struts, without_std):
+            raise InputError(
+                f"{where}.value: {row.value.value}: observers.{strut} does not know it, expected "
+                "an observer that does, such as kind kalman"
+            )
         names = [channel.name for channel in others]
         _check_name(row.channel, names, f"{where}.channel", "not measured")
         _check_overlap(row, where, struts, channels)
@@ -135,14 +138,13 @@ def _check_comparison(row: Limit, where: str, struts: Sequence[str], can_compare
         )
 
 
-def _check_std(row: Limit, where: str, struts: Sequence[str], without_std: Collection[str]) -> None:
-    """Refuse a limit on a standard deviation that an observer does not know."""
-    for strut in struts:
-        if strut in without_std and row.strut in (None, strut):
-            raise InputError(
-                f"{where}.value: {row.value.value}: observers.{strut} does not know it, expected "
-                "an observer that does, such as kind kalman"
-            )
+def struts_without_std(
+    row: Limit, struts: Sequence[str], without_std: Collection[str]
+) -> list[str]:
+    """Struts of a limit on the standard deviation whose observers do not know it."""
+    if row.value is not LimitedValue.FORCE_STD_N:
+        return []
+    return [strut for strut in struts if strut in without_std and row.strut in (None, strut)]
 
 
 def _of_height(channel: Channel) -> Iterator[Limit]:

@@ -62,7 +62,7 @@ def build_problems(
     for recording in held_out:
         check_fits(recording, spec)
     smooth = _smooth(held_out)
-    evaluated = divided_at_gaps(type(learnt).of_recordings(learnt.basis, smooth), smooth)
+    evaluated = _divide_at_gaps(type(learnt).of_recordings(learnt.basis, smooth), smooth)
     return Problems(learnt, evaluated, by_blocks=False)
 
 
@@ -89,7 +89,7 @@ def build(
     linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism)
     existing = track.existing_effects(spec, [recording.motion for recording in smooth])
     basis = ProblemBasis(spec, linear, existing, motions, block_s, plants)
-    return divided_at_gaps(kind.of_recordings(basis, smooth), smooth)
+    return _divide_at_gaps(kind.of_recordings(basis, smooth), smooth)
 
 
 def _smooth(
@@ -100,7 +100,7 @@ def _smooth(
     return [it._replace(grid=it.grid._replace(recording=k)) for k, it in enumerate(smooth)]
 
 
-def divided_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> Problem:
+def _divide_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> Problem:
     """The problem of the pieces between gaps of the applied force that are not interpolated.
 
     Raises:

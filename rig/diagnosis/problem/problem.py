@@ -316,9 +316,17 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def quadratic_mean(values: Sequence[float]) -> float:
+def quadratic_mean(values: Sequence[float], weights: Sequence[int] | None = None) -> float:
     """Quadratic mean; NaN if a value is."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    return float(np.sqrt(np.average(np.square(values), weights=weights)))
+
+
+def quadratic_means(
+    pairs: Sequence[BeforeAfter], weights: Sequence[int] | None = None
+) -> BeforeAfter:
+    """Quadratic means before and after."""
+    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
+    return BeforeAfter(quadratic_mean(before, weights), quadratic_mean(after, weights))
 
 
 def strut_effects(problem: Problem, candidate: Candidate) -> tuple[StrutEffect, ...]:
