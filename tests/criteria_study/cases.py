@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.search.criteria import SelectionCriteria
+from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis import test_planted_effects as on_bench
@@ -140,8 +141,11 @@ def _made(name):
 
 
 def answer(name: str, criteria: SelectionCriteria) -> Answer:
-    """The answer to a case."""
-    found = diagnose(*_made(name), criteria=criteria).diagnosis
+    """The answer to a case; "refused" where the recordings do not suffice with these criteria."""
+    try:
+        found = diagnose(*_made(name), criteria=criteria).diagnosis
+    except RecordingError:
+        return Answer("refused", frozenset(), white=False)
     families = {effect.family for effect in found.effects}
     if found.verdict == "not_explained":
         families = set()

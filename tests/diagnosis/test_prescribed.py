@@ -1,10 +1,12 @@
 """Effects planted in a dyno are found by their load cell; a complete model lacks none."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.search.criteria import CRITERIA
 from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import (
@@ -254,3 +256,9 @@ def test_an_interval_holds_the_truth():
         (effect,) = found.effects
         inside += holds(effect.parameters["damping_n_s_per_m"], 150.0, slack=0.0)
     assert inside >= 17
+
+
+def test_without_a_part_to_hold_out_a_recording_is_refused():
+    two_blocks = replace(CRITERIA, blocks=2)
+    with pytest.raises(RecordingError, match="dyno1: no part with motion can be held out"):
+        diagnose(dyno.model(), [dyno.run(dyno.Nothing(), duration_s=3.0)], criteria=two_blocks)

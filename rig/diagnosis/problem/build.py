@@ -58,6 +58,12 @@ def build_problems(
     problem_kind((*runs, *held_out))
     learnt = build(spec, runs, blocks, None if held_out else held_out_every)
     if not held_out:
+        if not any(np.any(grid.held_out) for grid in learnt.grids):
+            raise RecordingError(
+                f"{', '.join(run.name for run in runs)}: no part with motion can be held out to "
+                "evaluate the correction, expected motion over most of the recording: record a "
+                "longer run, or give another one with --held-out"
+            )
         return Problems(learnt, learnt, by_blocks=True)
     for recording in held_out:
         check_fits(recording, spec)
@@ -106,6 +112,8 @@ def _divide_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> 
     Raises:
         RecordingError: Less than half of a recording lies in pieces that are long enough.
     """
+    if not any(it.recording.force_gaps and it.recording.force_gaps.long_s for it in recordings):
+        return problem
     pieces: list[tuple[int, slice]] = []
     for k, (recording, grid, *_) in enumerate(recordings):
         gaps = recording.force_gaps
@@ -117,8 +125,6 @@ def _divide_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> 
                 "half a second or more, expected half"
             )
         pieces += [(k, piece) for piece in between if _is_fitted(problem, k, piece)]
-    if len(pieces) == len(recordings):
-        return problem
     divided = problem.cut(pieces)
     return divided.with_noise_of(nominal_model(divided, first_starts(divided, nominal(divided))))
 
