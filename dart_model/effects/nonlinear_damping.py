@@ -100,6 +100,25 @@ def _smooth_blow_off(
     return lost_damping_n_s_per_m * velocity_m_per_s * (1.0 - 1.0 / math.sqrt(1.0 + ratio * ratio))
 
 
+def _valves(
+    velocity_m_per_s: float,
+    lost_compression_n_s_per_m: float,
+    compression_knee_m_per_s: float,
+    added_rebound_n_s_per_m: float,
+    lost_rebound_n_s_per_m: float,
+    rebound_knee_m_per_s: float,
+    sharpness: float,
+) -> float:
+    if velocity_m_per_s > 0.0:
+        ratio = velocity_m_per_s / rebound_knee_m_per_s
+        added, lost = added_rebound_n_s_per_m, lost_rebound_n_s_per_m
+    else:
+        ratio = -velocity_m_per_s / compression_knee_m_per_s
+        added, lost = 0.0, lost_compression_n_s_per_m
+    share = 1.0 - (1.0 + ratio**sharpness) ** (-1.0 / sharpness)
+    return (lost * share - added) * velocity_m_per_s
+
+
 def _over_stroke(
     height_m: float, velocity_m_per_s: float, free_length_m: float, damping_n_s_per_m2: float
 ) -> float:
@@ -135,6 +154,17 @@ def _knees(*shares: float) -> Starts:
         return [(1.0, share * motion.speed_m_per_s) for share in shares]
 
     return moving(starts)
+
+
+@moving
+def _valve_starts(motion: Motion) -> list[Start]:
+    # Lost in compression, added and lost in rebound: alike, and more or less in rebound.
+    shapes = [(1.0, 0.0, 1.0), (1.0, 1.0, 2.0), (2.0, -1.0, 1.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)]
+    return [
+        (compression, share * motion.speed_m_per_s, added, lost, share * motion.speed_m_per_s, 3.0)
+        for compression, added, lost in shapes
+        for share in (0.2, 0.6)
+    ]
 
 
 @moving
@@ -287,6 +317,39 @@ SMOOTH_BLOW_OFF_DAMPING = _damper(
     simpler=("linear_damping", _FRICTION),
     shown=("lost_damping_n_s_per_m",),
 )
+
+VALVE_DAMPING = _damper(
+    name="valve_damping",
+    words="a non-linear damper (a blow-off valve in each direction)",
+    parameters=(
+        Parameter(
+            "lost_compression_n_s_per_m", "N·s/m", -1e12, 1e12,
+            "reduction of the damping beyond the knee in compression",
+        ),
+        Parameter(
+            "compression_knee_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee in compression"
+        ),
+        Parameter(
+            "added_rebound_n_s_per_m", "N·s/m", -1e12, 1e12,
+            "damping at low velocity in rebound less that in compression",
+        ),
+        Parameter(
+            "lost_rebound_n_s_per_m", "N·s/m", -1e12, 1e12,
+            "reduction of the damping beyond the knee in rebound",
+        ),
+        Parameter("rebound_knee_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee in rebound"),
+        Parameter("sharpness", "", 2.0, 12.0, "sharpness of both knees"),
+    ),
+    force=_valves,
+    reference="Dixon, The Shock Absorber Handbook (2007), 6.9 and 7.3, valves of each direction",
+    scaled=(0, 2, 3),
+    starts=_valve_starts,
+    bounds=within(
+        compression_knee_m_per_s=of_speed(0.08, 6.0), rebound_knee_m_per_s=of_speed(0.08, 6.0)
+    ),
+    simpler=("asymmetric_damping", "blow_off_damping", "smooth_blow_off_damping"),
+    shown=("lost_compression_n_s_per_m", "added_rebound_n_s_per_m", "lost_rebound_n_s_per_m"),
+)  # fmt: skip
 
 STROKE_DAMPING = _damper(
     name="stroke_damping",

@@ -55,6 +55,11 @@ def print_end(
         print_text(gaps.report(folder.name), "yellow")
     if following:
         print_text(f"Next: `{following}`")
+    if following.startswith("rig diagnose"):
+        print_text(
+            "A second run of another motion, given with --held-out, evaluates the correction; "
+            "without one, parts of this run do."
+        )
 
 
 def diagnosis_of(plan: "Plan", folder: Path) -> str:

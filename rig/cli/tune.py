@@ -294,11 +294,22 @@ def _propose_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None
     """Propose a limit on the standard deviation that an observer states, where there is none."""
     from rig.bridge.supervision_limits import LimitedValue
 
-    values = {row.value for row in plan.config.supervision.limits}
     expected_n = [it.tuned.expected.force_n for it in struts if it.tuned.observer.knows_std]
-    if not expected_n or LimitedValue.FORCE_STD_N in values:
+    if not expected_n:
         return
     limit_n = float(f"{_PROPOSED_LIMIT * max(expected_n):.2g}")
+    present_n = [
+        row.high
+        for row in plan.config.supervision.limits
+        if row.value is LimitedValue.FORCE_STD_N and row.high is not None
+    ]
+    if present_n:
+        if not limit_n / 2 <= min(present_n) <= 2 * limit_n:
+            print_text(
+                f"supervision.limits in {file} keeps force_std_n at {min(present_n):g}; "
+                f"{_PROPOSED_LIMIT:g} times the expected error is now {limit_n:g}."
+            )
+        return
     print_text(
         "An estimate remains valid however large a standard deviation it states. To hold one "
         f"that is less certain than you accept, for example {_PROPOSED_LIMIT:g} times the "

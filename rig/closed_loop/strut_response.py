@@ -14,8 +14,14 @@ _SECANT_M, USUAL_SPEED_M_PER_S = 2e-3, 0.1
 """Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
 steep at rest, counts as it acts in motion."""
 
+_SPEEDS_M_PER_S = np.geomspace(0.05, 10.0, 24)
+"""At which a strut has to dissipate: from a slow motion to three times that of a fast bench."""
+
 _SECANT_N = 1.0
 """Of the force, to which the response is linear."""
+
+_ROUNDING_N = 1e-6
+"""Force that counts as none."""
 
 
 class StrutResponse(NamedTuple):
@@ -48,3 +54,25 @@ def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int)
         acceleration, (_SECANT_N, _SECANT_M, USUAL_SPEED_M_PER_S)
     ).tolist()
     return StrutResponse(mobility, -stiffness, -damping)
+
+
+def driving_speeds_m_per_s(plant: AnyPlant, heights_m: Sequence[float]) -> list[float | None]:
+    """The lowest speed of each strut at which its force drives the motion; None without one.
+
+    The force at a velocity, less that at rest, has to be against it in a passive strut (van der
+    Schaft, L2-Gain and Passivity Techniques in Nonlinear Control, 2017, 2).
+    """
+    return [_driving_speed(plant, heights_m, index) for index in range(plant.struts)]
+
+
+def _driving_speed(plant: AnyPlant, heights_m: Sequence[float], index: int) -> float | None:
+    def force_n(velocity_m_per_s: float) -> float:
+        velocities = (velocity_m_per_s * np.eye(plant.struts)[index]).tolist()
+        state = plant.init(list(heights_m), velocities)
+        return plant.load(state, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n[index]
+
+    rest_n = force_n(0.0)
+    for speed in _SPEEDS_M_PER_S.tolist():
+        if force_n(speed) > rest_n + _ROUNDING_N or force_n(-speed) < rest_n - _ROUNDING_N:
+            return speed
+    return None

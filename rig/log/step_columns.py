@@ -35,7 +35,8 @@ _MEASURED = ("measured_height_m", "measured_t_ns")
 _PUBLISHED = StrutOutput.__struct_fields__
 
 STRUT_COLUMNS = (*_MEASURED, *_PUBLISHED)
-"""Columns of each strut, prefixed with its name and a dot; NaN where there is no value."""
+"""Columns of each strut, prefixed with its name and a dot; NaN where there is no value, but 0 for
+`valid`."""
 
 
 class Step(Struct, frozen=True, gc=False):
@@ -79,6 +80,8 @@ class LogColumns:
                 self._column_of[channel.index] = first[channel.strut]
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._blank = [nan] * begin_of_sensors + [nan, 0.0] * len(sensors)
+        for begin in published:  # invalid is what is sent before an estimate
+            self._blank[begin + _PUBLISHED.index("valid")] = 0.0
         self.names: tuple[str, ...] = (
             *(channel.column for channel in bench),
             *(f"{strut}.{name}" for strut in struts for name in STRUT_COLUMNS),
@@ -87,7 +90,7 @@ class LogColumns:
         """Names of the columns."""
 
     def numbers(self, step_input: StepInput, output: StepOutput) -> list[float]:
-        """Numbers of a tick; NaN where nothing arrived or nothing was published."""
+        """Numbers of a tick; NaN where nothing arrived or no estimate is published."""
         numbers, column_of = self._blank.copy(), self._column_of
         for sample in step_input.samples:
             column = column_of[sample.channel]

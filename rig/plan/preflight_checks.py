@@ -15,11 +15,12 @@ from rig.bridge.free_model import grace_of_applied_force_ns
 from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
-from rig.bus.bus import SHARED_INTERFACES, BusError, check_interface
+from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_interface
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
+from rig.closed_loop.strut_response import driving_speeds_m_per_s
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, vital_channels
@@ -103,7 +104,8 @@ def check(plan: Plan) -> list[Finding]:
         text = "the motion is prescribed: no loop is closed that could become unstable"
         return [*findings, Finding(Severity.OK, "poles", text)]
     plant = build_plant(plan)
-    return [*findings, *_stability(plan, plant), *_observability(plan, plant)]
+    dissipation = _dissipation(plan, plant)
+    return [*findings, *dissipation, *_stability(plan, plant), *_observability(plan, plant)]
 
 
 def errors(plan: Plan) -> list[Finding]:
@@ -380,13 +382,24 @@ def _limits(plan: Plan) -> list[Finding]:
         text += "longer than the signal stays constant in normal operation"
         findings.append(Finding(Severity.WARNING, "limits of frozen sensors", text))
     for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
-        severity = Severity.OK if rows else Severity.WARNING
-        findings.append(Finding(severity, f"limits of {name}", _describe_rows(rows) or "none"))
+        text = _describe_rows(rows) or "none"
+        wide = any(map(_limits_no_strut, rows))
+        if wide:
+            text += f"; height_m limits no strut: expected the travel of {name}"
+        severity = Severity.WARNING if wide or not rows else Severity.OK
+        findings.append(Finding(severity, f"limits of {name}", text))
     for channel, rows in zip(plan.channels, plan.limits.channels, strict=True):
         if rows and channel.role is not Role.HEIGHT:
             text = _describe_rows(rows)
             findings.append(Finding(Severity.OK, f"limits of {channel.name}", text))
     return findings
+
+
+def _limits_no_strut(limit: Limit) -> bool:
+    """Whether a limit on a height, such as that of a signal in counts, is wider than any travel."""
+    if limit.value is not LimitedValue.HEIGHT_M or limit.low is None or limit.high is None:
+        return False
+    return limit.high - limit.low > _LONGEST_STRUT_M
 
 
 def _describe_rows(rows: Sequence[Limit]) -> str:
@@ -431,9 +444,26 @@ def _load(plan: Plan) -> Finding:
         load += time_s / (cycle_ns * 1e-9)
     rate = f"{config.bus.bitrate / 1e6:g} Mbit/s"
     text = f"{load:.0%} of {rate} with the most stuff bits (configured messages alone)"
+    if config.bus.interface in WITHOUT_BIT_RATE:
+        text += f"; {config.bus.interface} has no bit rate, a CAN bus would have bus.bitrate"
     if load > FULL_LOAD:
         return Finding(Severity.ERROR, "bus load", f"{text}: the bus cannot carry it")
     return Finding(Severity.WARNING if load > HIGH_LOAD else Severity.OK, "bus load", text)
+
+
+def _dissipation(plan: Plan, plant: AnyPlant) -> list[Finding]:
+    """Struts whose force drives the motion above some speed: a disturbed model runs away there."""
+    speeds = driving_speeds_m_per_s(plant, [strut.free_length_m for strut in plan.struts])
+    return [
+        Finding(
+            Severity.WARNING,
+            f"damper of {name}",
+            f"drives the motion from {speed:.2g} m/s on instead of damping it, and a disturbed "
+            f"model does not come back from there: correct the laws of {plan.config.model}",
+        )
+        for name, speed in zip(plan.strut_names, speeds, strict=True)
+        if speed is not None
+    ]
 
 
 def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:

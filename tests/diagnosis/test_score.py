@@ -1,5 +1,7 @@
 """The score test about a fitted model: what it promises, and what it sees beside dry friction."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool
 from rig.diagnosis.search.score_test import find_changes
+from rig.diagnosis.search.screen import is_compatible
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.test_planted_effects import FrictionAndHardening
 from tests.diagnosis.test_prescribed import Orifice
@@ -28,6 +31,32 @@ def with_laws(pool, **laws):
     candidate = nominal(pool.problem).with_effects(*at)
     pool.attempt(model_for(pool.problem, pool.linear.fit, candidate, at), FULL)
     return pool.fits[candidate].fit
+
+
+class Regressive(little_dyno.Nothing):
+    """Damping of 900 N·s/m that turns into -300 at 0.1 m/s: the damper drives from 0.4 m/s on."""
+
+    def force(self, t, z, v, state, warm):
+        return math.copysign(1200.0 * max(abs(v) - 0.1, 0.0), v)
+
+
+def test_a_damper_that_drives_beyond_the_recorded_velocities_is_not_valid():
+    pool = pool_of(little_dyno, Regressive())
+    fitted = with_laws(pool, blow_off_damping=[1000.0, 0.1])
+    assert law_values(pool.problem, fitted)[0, "blow_off_damping"][0] > 1000.0
+    assert "at higher velocities" in pool.invalid[fitted.candidate]
+
+
+def test_a_strut_has_one_damper_force_over_velocity():
+    curve, other, zone = (
+        (0, name) for name in ("power_damping", "blow_off_damping", "zone_damping")
+    )
+    assert not is_compatible(other, [curve])
+    assert not is_compatible(other, [zone, curve])
+    assert is_compatible((1, other[1]), [curve])
+    assert is_compatible(zone, [curve])
+    assert is_compatible(curve, [zone])
+    assert not is_compatible(zone, [zone])
 
 
 def changes_of(pool, fitted):

@@ -91,6 +91,8 @@ CLOSED_FORMS = [
     ("arctan_damping", [4.0, 0.5], {"velocity": 0.5}, -0.5 * math.pi),
     ("blow_off_damping", [4.0, 0.5], {"velocity": -0.75}, -1.0),
     ("smooth_blow_off_damping", [4.0, 0.5], {"velocity": 0.5}, 2.0 * (1.0 - math.sqrt(0.5))),
+    ("valve_damping", [4.0, 0.5, 1.0, 2.0, 0.25, 2.0], {"velocity": 0.5},
+     1.0 * (1.0 - math.sqrt(0.2)) - 0.5),
     ("stroke_damping", [40.0], {"height": 0.4, "velocity": 0.5}, 2.0),
     ("position_dependent_damping", [400.0], {"height": 0.4, "velocity": 0.5}, -2.0),
     ("zone_damping", [4.0, 0.5, 0.1], {"height": 0.6, "velocity": 1.0}, -4.0 * math.exp(-1.0)),

@@ -70,7 +70,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
         asking = threading.Thread(target=lambda: answers.append(ask(run, {"set": {GAIN: 5e4}})))
         asking.start()
         bridge = None
-        while bridge is None:  # ticks, until there is something to take
+        while bridge is None and asking.is_alive():  # ticks, until there is something to take
             bridge = requests.changes(42_000_000)
         asking.join()
         assert requests.changes(43_000_000) is None

@@ -25,6 +25,7 @@ from rig.diagnosis.problem.problem import (
     free_linear,
     nominal,
 )
+from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit, validation_costs
 from rig.diagnosis.search.score_test import ModelChange, find_changes
@@ -51,6 +52,11 @@ FULL = Effort(20, 1e-4, 2)
 """Fits that decide."""
 FINAL = Effort(15, 1e-6, 2)
 """The fit that is reported; that of a free run once more with finer steps."""
+
+
+_SLOW, _DRY = (0.02, 0.2), 0.5
+"""Velocities, as shares of their RMS, at which dry friction has at least this share of its force at
+usual ones. What corrects the formula of a damper grows with velocity there."""
 
 
 class ValidatedModel(NamedTuple):
@@ -285,6 +291,7 @@ class Pool:
             larger.size > smaller.size
             and self.is_formula(smaller)
             and not _adds_a_kind(smaller, larger)
+            and not self.adds_dry_friction(smaller, larger)
             and not self.is_imitated(larger, smaller)
         ):
             return False
@@ -320,6 +327,25 @@ class Pool:
         share = self.criteria.imitation ** (2 * (larger.size - smaller.size))
         is_right = self.at_floor(larger) or larger.excess < share * smaller.excess
         return is_right and not self.is_near(smaller, larger)
+
+    def adds_dry_friction(self, smaller: ValidatedModel, larger: ValidatedModel) -> bool:
+        """Whether friction alone is added, and acts where a damper hardly does: at low velocity."""
+        few, many = Counter(smaller.families), Counter(larger.families)
+        if many - few != Counter(["friction"]) or few - many or "friction" in few:
+            return False
+        (row,) = (
+            len(larger.fit.candidate.kept) + i
+            for i, (_, name) in enumerate(larger.fit.candidate.new)
+            if effect(name).family == "friction"
+        )
+        strut, force = forces_along(self.problem, larger.fit.model, self.along)[row]
+        speed = np.concatenate([np.abs(track.velocities_m_per_s[strut]) for _, track in self.along])
+        share = speed / max(float(np.sqrt(np.mean(speed**2))), 1e-100)
+        slow, usual = (share > _SLOW[0]) & (share < _SLOW[1]), share >= 1.0
+        if not (np.any(slow) and np.any(usual)):
+            return False
+        force = np.abs(force)
+        return float(np.mean(force[slow])) > _DRY * float(np.mean(force[usual]))
 
     def is_near(self, model: ValidatedModel, best: ValidatedModel) -> bool:
         """Whether a model's cost is not hopeless compared with the best one's."""

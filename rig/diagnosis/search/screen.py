@@ -10,6 +10,7 @@ all other laws of their combination.
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from os import cpu_count
 from types import MappingProxyType
 from typing import NamedTuple
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
+from dart_model.effects.calling import arguments
 from rig.diagnosis.numerics.compiled import compile_law
 from rig.diagnosis.numerics.least_squares import (
     Differences,
@@ -55,7 +57,7 @@ _REFINED_STARTS = 2
 _SIDE_VALLEY = 2.0
 """Times a law's least cost up to which another of its starts is refined."""
 _REPEATABLE = ("stop", "nonlinear_damping")
-"""Families of which a strut may have two: stops at both ends; a damper's valves."""
+"""Families of which a strut may have two: stops at both ends; a damper's zones."""
 _FINE = 5
 """Laws of a round that are refined on all samples: one more than `fitted_a_size`."""
 _REFINEMENT = Effort(7, 1e-3, 1)
@@ -423,11 +425,21 @@ def _more_general_laws(
 
 def is_compatible(at: StrutEffect, laws: Sequence[StrutEffect]) -> bool:
     """Whether a law may be combined with others: two formulas of one family imitate a third."""
-    family = effect(at[1]).family
-    return at not in laws and (
-        family in _REPEATABLE
-        or all(strut != at[0] or effect(name).family != family for strut, name in laws)
-    )
+    item = effect(at[1])
+    alike = [effect(name) for strut, name in laws if strut == at[0]]
+    alike = [other for other in alike if other.family == item.family]
+    if item.family not in _REPEATABLE:
+        return not alike
+    # A damper has one force over velocity; what acts in a part of the stroke may be added to it.
+    curves = sum(_reads_velocity_alone(it.name) for it in (item, *alike))
+    return item not in alike and curves < 2
+
+
+@cache
+def _reads_velocity_alone(name: str) -> bool:
+    item = effect(name)
+    read = {it.name for it in arguments(item.force, item) if it.origin in ("motion", "states")}
+    return read == {"velocity_m_per_s"}
 
 
 @np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 _CELLS = 12
 """Cells of height and of velocity in which power is evaluated."""
+_FASTER = np.geomspace(1.25, 10.0, 8)
+"""Multiples of the largest recorded velocity at which a strut has to dissipate too: where its force
+drives, a model that an observer disturbs never comes back."""
 _TINY = 1e-100
 """Least divisor."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
@@ -132,29 +135,42 @@ def _find_cancelling_laws(
 def _find_active_strut(
     problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
 ) -> str | None:
-    """Reason against a strut that feeds energy in at a height and velocity of the motion."""
-    constants = strut_constants(problem, result.parts.linear)
-    slots = slots_of(problem, result.candidate).each
-    effects = strut_effects(problem, result.candidate)
+    """Reason against a strut that feeds energy in, along the motion or at higher velocities."""
     for strut in range(len(problem.motions)):
         if not any(at == strut for at, _ in result.candidate.new):
             continue
         z = np.concatenate([track.heights_m[strut] for track in along])
         w = np.concatenate([track.velocities_m_per_s[strut] for track in along])
         cells = np.unique(np.column_stack([_cell(z), _cell(w)]), axis=0, return_index=True)[1]
-        moving = _points(z[cells], w[cells], len(problem.motions), strut)
-        still = moving._replace(velocities_m_per_s=np.zeros_like(moving.velocities_m_per_s))
-        force = -constants[strut, 2] * w[cells]
-        for (at, name), slot in zip(effects, slots, strict=True):
-            if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
-                values = result.parts.effects[slot.parameters]
-                force = force + law_force(moving, strut, name, values, constants)
-                force = force - law_force(still, strut, name, values, constants)
-        power = force * w[cells]
-        if float(power.max()) > criteria.passive * max(-float(power.min()), 0.0):
-            name = problem.spec.struts[strut].name
+        power = _damper_power(problem, result, strut, z[cells], w[cells])
+        tolerance = criteria.passive * max(-float(power.min()), 0.0)
+        name = problem.spec.struts[strut].name
+        if float(power.max()) > tolerance:
             return f"strut {name} would feed energy in (not passive)"
+        heights = z[np.unique(_cell(z), return_index=True)[1]]
+        faster = float(np.abs(w).max()) * np.concatenate([-_FASTER, _FASTER])
+        power = _damper_power(problem, result, strut, *map(np.ravel, np.meshgrid(heights, faster)))
+        if float(power.max()) > tolerance:
+            return f"strut {name} would feed energy in at higher velocities (not passive)"
     return None
+
+
+def _damper_power(problem: Problem, result: Fit, strut: int, z: Array, w: Array) -> Array:
+    """Power in W that the part of a strut's force that vanishes at rest feeds in, shape (N,).
+
+    At heights `z` in m and velocities `w` in m/s, shapes (N,).
+    """
+    constants = strut_constants(problem, result.parts.linear)
+    moving = _points(z, w, len(problem.motions), strut)
+    still = moving._replace(velocities_m_per_s=np.zeros_like(moving.velocities_m_per_s))
+    force = -constants[strut, 2] * w
+    slots = slots_of(problem, result.candidate).each
+    for (at, name), slot in zip(strut_effects(problem, result.candidate), slots, strict=True):
+        if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
+            values = result.parts.effects[slot.parameters]
+            force = force + law_force(moving, strut, name, values, constants)
+            force = force - law_force(still, strut, name, values, constants)
+    return force * w
 
 
 def _cell(values: Array) -> Array:
