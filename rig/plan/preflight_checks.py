@@ -78,6 +78,7 @@ def check(plan: Plan) -> list[Finding]:
         *map(_sample_times, channel_of.values()),
         *_model(plan),
         *_gravity(plan),
+        *_inertia(plan),
         *_lengths(plan),
         *[_zero(plan, channel) for channel in plan.heights],
         *_resolution(plan),
@@ -157,6 +158,26 @@ def _gravity(plan: Plan) -> list[Finding]:
         return []
     text = f"{gravity:g} m/s², expected 9.81, or 0 for a horizontal guide"
     return [Finding(Severity.WARNING, "gravity of the model", text)]
+
+
+def _inertia(plan: Plan) -> list[Finding]:
+    """Bodies that rotate and whose moments of inertia are not stated."""
+    if not isinstance(plan.model.skeleton, InlineSkeleton):
+        return []
+    rotating: set[str] = set()
+    for body in plan.model.skeleton.bodies:
+        if body.joint.type != "prismatic" or body.joint.parent in rotating:
+            rotating.add(body.name)
+    unstated = [
+        body.name
+        for body in plan.model.skeleton.bodies
+        if body.name in rotating and body.inertia_kg_m2 is None
+    ]
+    if not unstated:
+        return []
+    text = f"none stated for {', '.join(unstated)}, which rotates: the number of the mass is taken "
+    text += "(10 kg: 10 kg·m²); expected inertia_kg_m2"
+    return [Finding(Severity.WARNING, "inertia", text)]
 
 
 def _lengths(plan: Plan) -> list[Finding]:

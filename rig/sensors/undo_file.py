@@ -40,7 +40,8 @@ def configure_with_undo(
         undo.open("x").close()
     except FileExistsError:
         raise InputError(
-            f"--before {undo}: exists, expected a new file (or --restore it first)"
+            f"--before {undo}: exists, expected a new file; if the device still has the changes "
+            f"in it, undo them first with --restore {undo}"
         ) from None
     except OSError as error:
         raise InputError(f"--before {undo}: cannot be written: {error.strerror}") from error

@@ -209,6 +209,28 @@ def test_friction_beside_a_hardening_spring_is_found_as_two():
     assert len(found.effects) <= 3
 
 
+class FrictionAndValves(Nothing):
+    """A shock absorber: a seal that rubs, and valves that open at 0.15 and 0.12 m/s."""
+
+    def force(self, t, z, v, state):
+        lost, knee = (45.0, 0.15) if v < 0.0 else (85.0, 0.12)
+        beyond = abs(v) - knee
+        bend = 0.5 * (beyond + math.hypot(beyond, 0.3 * knee))
+        at_rest = 0.5 * (-knee + math.hypot(knee, 0.3 * knee))
+        added = 60.0 * v if v > 0.0 else 0.0
+        return Friction().force(t, z, v, state) - added + math.copysign(lost * (bend - at_rest), v)
+
+
+@pytest.mark.long
+def test_friction_beside_the_valves_of_a_damper_is_found_as_two():
+    runs = [bench.run(FrictionAndValves()), bench.run(FrictionAndValves(), seed=2)]
+    found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
+    assert sorted(e.family for e in found.effects) == ["friction", "nonlinear_damping"]
+    (friction,) = (e for e in found.effects if e.family == "friction")
+    (value,) = (v.value for name, v in friction.parameters.items() if name.startswith("coulomb"))
+    assert value == pytest.approx(6.0, rel=0.1)
+
+
 class GainAndPreload(Nothing):
     gain = 1.07
 

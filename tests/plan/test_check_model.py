@@ -12,6 +12,10 @@ from rig.plan.preflight_checks import Severity, check
 def findings(folder, damping_n_s_per_m=100.0, effects=(), **keys):
     model = yaml.safe_load((MODELS / "reference.yaml").read_text())
     model["struts"][0] |= {"damping_n_s_per_m": damping_n_s_per_m, "effects": list(effects)}
+    return findings_of(folder, model, **keys)
+
+
+def findings_of(folder, model, **keys):
     (folder / "model.yaml").write_text(yaml.safe_dump(model))
     config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
     (folder / "rig.yaml").write_text(yaml.safe_dump(config | {"model": "model.yaml"} | keys))
@@ -37,6 +41,15 @@ def test_a_damper_that_drives_at_high_speed_is_a_warning(tmp_path):
     assert found.severity is Severity.WARNING
     speed = float(found.text.removeprefix("drives the motion from ").split(" m/s")[0])
     assert 1.0 < speed < 1.35
+
+
+@pytest.mark.parametrize(("inertia", "is_found"), [(None, True), ([1.0, 1.0, 1.0], False)])
+def test_a_body_that_rotates_without_moments_of_inertia_is_a_warning(tmp_path, inertia, is_found):
+    model = yaml.safe_load((MODELS / "reference.yaml").read_text())
+    arm = {"name": "arm", "mass_kg": 1.0, "joint": {"type": "revolute", "axis": [0, 1, 0]}}
+    arm |= {} if inertia is None else {"inertia_kg_m2": inertia}
+    model["skeleton"]["bodies"].append(arm)
+    assert ("inertia" in findings_of(tmp_path, model)) is is_found
 
 
 @pytest.mark.parametrize(("interface", "has_none"), [("virtual", True), ("socketcan", False)])
