@@ -1,6 +1,7 @@
 """`rig evaluate`."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,13 +43,14 @@ def evaluate_command(
     from rig.recordings.read import read_recording
     from rig.recordings.recording import RecordingError
 
+    read_once = cache(read_recording)
     specs = [load_named_model(name, Path()) for name in model]
     rows: list[tuple[str, RunEvaluation]] = []
     gaps: dict[str, Gaps] = {}
     failed: list[str] = []
     for name, spec in zip(model, specs, strict=True):
-        struts = [strut.name for strut in spec.struts]
-        recordings = [read_recording(path, struts) for path in runs]
+        struts = tuple(strut.name for strut in spec.struts)
+        recordings = [read_once(path, struts) for path in runs]
         gaps = {item.name: item.force_gaps for item in recordings if item.force_gaps is not None}
         for recording in recordings:
             try:
