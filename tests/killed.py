@@ -30,12 +30,13 @@ _COUNTS = struct.Struct("<qq")
 
 TEXT = """
 {kills} runs of the reference case are killed (SIGKILL), each at a random moment, 0.3 to 4 s after
-its first tick. They run in real time, with the simulated bench on a virtual bus in the same
-process. The process counts frames and ticks before it logs them, in shared memory that outlives it.
-The frames and the logged ticks (rows of `steps.arrow`) on the disk are then counted, and the run is
-replayed from its frames. The logged ticks are compared with the replay: a tick is different if they
-do not agree bit for bit. Ticks that the log lost cannot be compared; the replay computes them from
-the frames on the disk, at the times of the configured rate. A loss of power is not tested.
+its first tick. They run in real time at 1 kHz, with the simulated bench on a virtual bus in the
+same process. The process counts received frames and ticks before it logs them, in shared memory
+that outlives it. The received frames and the logged ticks (rows of `steps.arrow`) on the disk are
+then counted, and the run is replayed from its frames. The logged ticks are compared with the
+replay: a tick counts as different if its row and the replayed row do not agree bit for bit. Ticks
+that the log lost cannot be compared; the replay computes them from the frames on the disk, at the
+times of the configured rate. A loss of power is not tested.
 """
 
 
@@ -97,13 +98,13 @@ def main() -> None:
         steps_lost = max(ticks - logged for _, _, ticks, _, logged, *_ in rows)
         not_replayed = [row[2] - row[5] for row in rows]
         sentences = (
-            f"No run lost more than {most} of its frames. Up to {steps_lost} logged ticks of a run "
-            f"were lost; the replay computed\nall but the last {min(not_replayed)} to "
-            f"{max(not_replayed)} ticks of each run again."
+            f"No run lost more than {most} of the frames that it had received. Up to {steps_lost} "
+            "ticks of a run are missing\nfrom its log; the replay computed all ticks of each run "
+            f"except for the last {min(not_replayed)} to {max(not_replayed)}."
         )
         write_evidence(
             "killed",
-            "What is lost when the process is killed",
+            "What is lost when the bridge's process is killed",
             TEXT.format(kills=asked.kills),
             [sentences, table((*heads, *counts), rows)],
             command_line(),

@@ -31,16 +31,21 @@ BENCHES, DAMPERS = 4, 40
 PATTERN = "{bench}/{date}/{damper}"
 TEXT = """
 A fleet of {RUNS} simulated dyno runs ({DAMPERS} dampers on {BENCHES} benches, {seconds:g} s at
-{RATE_HZ:g} Hz per run) is diagnosed twice on one machine with {CORES} cores: with a Dask cluster of
-{WORKERS} workers, one of which is killed after a third of the runs, and with {CORES} processes. The
-throughput is compared with that of plain loops, which diagnose one run after the other: {CORES}
-such loops run simultaneously, one per core; together they diagnose {singles} runs, each run once.
+{RATE_HZ:g} Hz per run) is diagnosed in two campaigns on one machine with {CORES} cores: with a Dask
+cluster of {WORKERS} workers, one of which is killed after a third of the runs, and with {CORES}
+processes. The throughput is compared with that of plain loops, which diagnose one run after the
+other: {CORES} such loops run simultaneously, one per core; together they diagnose {singles} runs,
+each run once.
 
-The cost of distribution is the CPU time of the campaign's own process and of Dask's scheduler. The
-runs are short: with longer ones, distribution costs a smaller share. The fixed cost of a campaign
-is divided by the number of its runs: with few runs, the cost per run is larger. The loops and the
-two campaigns ran at different times, under a different load of the machine. A ratio above 1 comes
-from this load, not from distribution.
+As the cost of distribution, the CPU time of the campaign's process, which distributes the runs and
+writes the store, and that of Dask's scheduler are counted. The overhead inside the workers is not
+counted. The runs are short: with longer ones, distribution costs a smaller share. The cost per run
+contains a share of the fixed cost of the campaign, which is larger with few runs. The cost for a
+million runs is a million times this cost per run, and therefore rather too high.
+
+The loops and the two campaigns ran one after the other, each under a different load of the machine.
+The throughput depends on this load: a ratio above 1 is its effect. The ratios therefore neither
+measure the cost of distribution nor compare Dask with processes; the CPU times do.
 """
 
 
@@ -197,11 +202,11 @@ def main() -> None:
         ((runs, keys),) = store.query(out, "SELECT count(*), count(DISTINCT key) FROM runs")[1]
         print(f"both stores hold the same: {is_same}; {runs} runs, {keys} different")
         if given.page:
-            counts = f"Each of the {runs} recordings is in them exactly once."
+            counts = f"Each store contains each of the {runs} runs exactly once."
             if not is_same or not runs == keys == len(sources):
                 counts = (
                     f"The store of the processes contains {runs} runs with {keys} different keys, "
-                    f"for {len(sources)} recordings."
+                    f"expected {len(sources)} of each."
                 )
             sentences = (
                 f"One worker {'was' if is_gone else 'was not'} killed during the Dask campaign. "
