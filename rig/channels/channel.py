@@ -50,8 +50,8 @@ class Zero(BaseModel):
     """A reading of a position sensor at a known length of the strut; `rig zero` measures it.
 
     Attributes:
-        reads: Reading of the sensor in m, after its scaling: by the DBC, or by a mapping's gain and
-            unit.
+        reads: Reading of the sensor in m, after the conversion by gain and unit (in a
+            configuration: by the DBC).
         at_m: Length of the strut at that reading, in m.
     """
 

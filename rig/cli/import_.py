@@ -76,7 +76,7 @@ def import_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Import a foreign table as CSV, a bus log or an export as a run, an FMU as a model.
+    """Import a table as CSV, a bus log or an export as a run, or an FMU as a model.
 
     A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, an MTS file at least --rebound. A bus
     log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export` wrote as MF4 or

@@ -29,11 +29,11 @@ class TextLayout(_Section):
 
     Attributes:
         separator: One character, `tab`, or `whitespace` for any run of spaces and tabs.
-        decimal: Decimal sign: a point or a comma.
+        decimal: Decimal separator: a point or a comma.
         encoding: Character encoding, by its name in Python.
-        skip_lines: Lines before the column names, or before the data where there are no names.
-        column_names: Whether the file has a line with column names.
-        skip_after_names: Lines between the names and the data, such as one with units.
+        skip_lines: Lines before the header line, or before the data if there is none.
+        column_names: Whether the file has a header line with the names of the columns.
+        skip_after_names: Lines between the header line and the data, such as a line with units.
         first_row: First row of data that is used, counted from 0.
         rows: Number of rows that are used; all if absent.
     """
@@ -62,8 +62,8 @@ class TimeColumn(_Section):
     Attributes:
         column: Column of the time, by its name or its number (from 1).
         unit: Unit of a column of numbers, such as `s` or `ms`.
-        date_format: Format of a column of dates, as for C's `strptime`, or `iso` for ISO 8601;
-            only for text tables.
+        date_format: Format of a column of dates: the codes of Python's `strptime` (`%f` for
+            fractions of a second), or `iso` for ISO 8601; only for text tables.
         sampling_rate_hz: Rows per second, if the table has no column of times.
     """
 
@@ -88,10 +88,9 @@ class _Channel(_Section):
 
     Attributes:
         column: Column of the quantity, by its name or its number (from 1).
-        unit: Unit of the product of gain and reading, such as `mm`, `kN`, `lbf` or `degC`.
+        unit: Unit of gain times reading.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
-            sensitivity of the sensor, such as 20 for a height sensor with 20 mm/V, or 500 for a
-            load cell with 500 N/V.
+            sensitivity of the sensor.
     """
 
     column: ColumnName
@@ -114,6 +113,9 @@ class HeightChannel(_Channel):
     """A height.
 
     Attributes:
+        unit: Unit of gain times reading, such as `mm`.
+        gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
+            sensitivity of the sensor, such as 20 for 20 mm/V.
         zero: A reading at a known length of the strut; without it the reading is the length.
         reversed: True if the reading falls while the strut gets longer; requires `zero`.
     """
@@ -138,6 +140,9 @@ class ForceChannel(_Channel):
     """A force.
 
     Attributes:
+        unit: Unit of gain times reading, such as `kN` or `lbf`.
+        gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
+            sensitivity of the sensor, such as 500 for 500 N/V.
         tare_n: Reading without a force, in N after the gain and the conversion of the unit, and
             before a reversal.
         reversed: True if the table has the opposite sign.
@@ -156,6 +161,7 @@ class TemperatureChannel(_Channel):
     """A temperature; `offset_k` is added.
 
     Attributes:
+        unit: Unit of gain times reading, such as `degC`.
         offset_k: Offset in K that is added after the gain and the conversion of the unit.
     """
 
@@ -171,7 +177,8 @@ class TableMapping(_Section):
     """The meaning of a foreign table.
 
     Attributes:
-        table: Layout of a text table; not used for other files.
+        table: Layout of a text table. Of its keys, only `first_row` and `rows` are also used for
+            XLSX, TDMS and MTS files; MF4 files use none of them.
         time: Times of the rows; required except for MF4 files, whose channels have times.
         height: Height of the strut, which grows in rebound.
         applied_force: Force on the body, positive upwards (force-driven bench); this or

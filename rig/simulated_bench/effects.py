@@ -125,17 +125,20 @@ _PARAMETERS: dict[LawCode, tuple[EffectParameter, ...]] = {
 _WORDS: dict[LawCode, str] = {
     LawCode.PRELOAD: "constant force",
     LawCode.LINEAR_STIFFNESS: "linear spring without force at the free length",
-    LawCode.QUADRATIC_STIFFNESS: "force proportional to the square of the deflection",
-    LawCode.CUBIC_STIFFNESS: "force proportional to the cube of the deflection",
-    LawCode.PROGRESSIVE_STIFFNESS: "spring with a restoring force of `force_n` (sinh(x) - x), "
-    "where x is the deflection over `length_m`",
-    LawCode.GAS_SPRING: "polytropic gas spring: `charge_force_n` at the free length, where the "
-    "column of gas is `gas_length_m` long",
+    LawCode.QUADRATIC_STIFFNESS: "force -`stiffness_n_per_m2` * deflection², with the same sign "
+    "on both sides of the free length",
+    LawCode.CUBIC_STIFFNESS: "restoring force proportional to the cube of the deflection",
+    LawCode.PROGRESSIVE_STIFFNESS: "spring with the restoring force `force_n` * (sinh(x) - x), "
+    "where x = deflection / `length_m`",
+    LawCode.GAS_SPRING: "polytropic gas spring with the force `charge_force_n` at the free length, "
+    "at which the gas column is `gas_length_m` long",
     LawCode.BUMP_STOP: "stop in compression (Hunt-Crossley)",
     LawCode.REBOUND_STOP: "stop in rebound (Hunt-Crossley)",
-    LawCode.BACKLASH: "further spring without force in `gap_m` about `centre_height_m` (dead zone)",
+    LawCode.BACKLASH: "additional spring with free play: no force within ± `gap_m`/2 of "
+    "`centre_height_m`",
     LawCode.LINEAR_DAMPING: "linear damper",
-    LawCode.QUADRATIC_DAMPING: "force proportional to the square of the velocity",
+    LawCode.QUADRATIC_DAMPING: "damping force proportional to the square of the velocity, against "
+    "the motion",
     LawCode.ASYMMETRIC_DAMPING: "linear damper, different in compression and rebound",
     LawCode.DIGRESSIVE_DAMPING: "damper whose force approaches a constant above the knee",
     LawCode.POSITION_DEPENDENT_DAMPING: "damping proportional to the square of the "
@@ -144,13 +147,15 @@ _WORDS: dict[LawCode, str] = {
     LawCode.BOUC_WEN: "hysteresis (Bouc-Wen)",
     LawCode.MAXWELL: "spring and damper in series",
     LawCode.PERIODIC_FORCE: "sine force",
-    LawCode.TEMPERATURE_FADE: "factor on the damper curve: exp(-`fraction_per_k` (temperature - "
+    LawCode.TEMPERATURE_FADE: "factor on the damper curve: exp(-`fraction_per_k` * (temperature - "
     "`reference_c`))",
-    LawCode.TIME_FADE: "factor on the damper curve that falls from 1 to `final_fraction`",
-    LawCode.HIDDEN_MASS: "further mass on the upper body, through a spring and a damper",
-    LawCode.ADDED_MASS: "further mass on the upper body",
-    LawCode.INPUT_GAIN: "factor on the applied force (1 changes nothing)",
-    LawCode.DELAY: "delay of the applied force",
+    LawCode.TIME_FADE: "factor on the damper curve that changes exponentially from 1 to "
+    "`final_fraction`, with the time constant `time_constant_s`",
+    LawCode.HIDDEN_MASS: "additional mass that a spring and a damper connect to the upper body",
+    LawCode.ADDED_MASS: "additional mass on the upper body",
+    LawCode.INPUT_GAIN: "ratio of the force that acts on the body to the measured applied force (1 "
+    "changes nothing)",
+    LawCode.DELAY: "delay of the force that acts on the body behind the measured applied force",
 }
 _STATES = {LawCode.FRICTION: 1, LawCode.BOUC_WEN: 1, LawCode.MAXWELL: 1, LawCode.HIDDEN_MASS: 2}
 

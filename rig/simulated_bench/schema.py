@@ -65,7 +65,7 @@ class _Curve(_Section):
 
 
 class SpringCurve(_Curve):
-    """Spring force over height, by points; monotone cubic between, straight beyond.
+    """Spring force over height, by points; monotone cubic between, linear beyond.
 
     Attributes:
         height_m: Heights, increasing, in m.
@@ -77,7 +77,7 @@ class SpringCurve(_Curve):
 
 
 class DamperCurve(_Curve):
-    """Damper force over velocity, by points; monotone cubic between, straight beyond.
+    """Damper force over velocity, by points; monotone cubic between, linear beyond.
 
     Attributes:
         velocity_m_per_s: Time derivatives of the height (rebound is positive), increasing, in m/s.
@@ -93,11 +93,14 @@ class BenchStrut(_Section):
 
     Attributes:
         name: Name of the strut.
-        between: Lower and upper body. Every body is the upper body of exactly one strut.
+        between: Lower and upper body. The lower one is `world` or the upper body of a strut earlier
+            in the list. Every body is the upper body of exactly one strut.
         free_length_m: Height at which the deflection in the laws of undeclared effects is zero, in
             m.
-        spring: Spring curve, by points: monotone cubic between them, straight beyond.
-        damper: Damper curve, by points: monotone cubic between them, straight beyond.
+        spring: Spring curve, given by points: monotone cubic interpolation between them, linear
+            extrapolation beyond them.
+        damper: Damper curve, given by points: monotone cubic interpolation between them, linear
+            extrapolation beyond them.
         initial_height_m: Height at the start in m; the static equilibrium if absent.
     """
 
@@ -159,10 +162,10 @@ class HeightSine(_Sine):
 
 
 class _Multisine(_Section):
-    """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
+    """Sines of equal amplitude and random phase at equally spaced frequencies of a band.
 
     Attributes:
-        kind: `multisine`: sines of equal amplitude and random phase on equally spaced frequencies.
+        kind: `multisine`: sines of equal amplitude and random phase at equally spaced frequencies.
         low_hz: Lowest frequency in Hz.
         high_hz: Highest frequency in Hz.
         lines: Number of frequencies.
@@ -456,8 +459,8 @@ class Transmission(_Section):
         strut_force: Load cell, if the message carries one.
         temperature: Thermometer, if the message carries one.
         counter: Signal that counts the frames, for a message without E2E protection.
-        time: Signal with the bench's time of the sample; it restarts at zero at the end of its
-            range.
+        time: Signal with the sample time by the clock of the bench; it wraps around at the end of
+            its range.
     """
 
     message: str
@@ -491,8 +494,8 @@ class BenchConfig(_Section):
         struts: Struts. Each carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any.
         prescribed_motion: The motion that drives a strut, if any (a dyno).
-        temperature: Temperature of the damper: the power that its curve dissipates heats it, and
-            the air cools it.
+        temperature: Temperature of the dampers (one for all): the power that they dissipate by
+            their curves heats them, and the air cools them.
         undeclared_effects: Effects of the bench that the bridge's model does not contain.
         transmissions: Messages that the bench sends.
         seed: Seed of the random numbers for noise, jitter and loss.
