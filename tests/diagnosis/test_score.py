@@ -10,12 +10,13 @@ from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.problem.problem import nominal
 from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
 from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool
 from rig.diagnosis.search.score_test import find_changes
-from rig.diagnosis.search.screen import is_compatible
+from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law
 from tests.diagnosis import little_bench, little_dyno
-from tests.diagnosis.test_planted_effects import FrictionAndHardening
+from tests.diagnosis.test_planted_effects import FrictionAndHardening, FrictionAndValves
 from tests.diagnosis.test_prescribed import Orifice
 
 
@@ -45,6 +46,29 @@ def test_a_damper_that_drives_beyond_the_recorded_velocities_is_not_valid():
     fitted = with_laws(pool, blow_off_damping=[1000.0, 0.1])
     assert law_values(pool.problem, fitted)[0, "blow_off_damping"][0] > 1000.0
     assert "at higher velocities" in pool.invalid[fitted.candidate]
+
+
+def test_friction_and_valves_begin_where_the_motion_shows_both():
+    pool = pool_of(little_bench, FrictionAndValves())
+    stage = pool.linear_stage
+    found = screen_damper_with_friction(stage, no_law(stage), 0)
+    (coulomb_n, _), valves = found.values
+    assert coulomb_n == pytest.approx(6.0, rel=0.2)
+    linear = pool.linear.fit.parts.linear + linear_changes(stage, found)
+    (damping,) = (
+        change for change, p in zip(linear, pool.problem.linear, strict=True) if p.kind == "damping"
+    )
+    for v in (-0.4, -0.2, -0.1, 0.1, 0.2, 0.4):
+        shown = effect("valve_damping").force(v, *valves) - damping * v
+        true = FrictionAndValves().force(0.0, 0.0, v, ()) + math.copysign(6.0, v)
+        assert shown == pytest.approx(true, abs=0.1 * 0.4 * little_bench.DAMPING)
+
+
+def test_a_start_for_friction_needs_friction():
+    pool = pool_of(little_dyno, Regressive())
+    stage = pool.linear_stage
+    found = screen_damper_with_friction(stage, no_law(stage), 0)
+    assert found is None or found.values[0][0] < 1.0
 
 
 def test_a_strut_has_one_damper_force_over_velocity():

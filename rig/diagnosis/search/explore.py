@@ -9,11 +9,14 @@ References:
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from dart_model.effects import effect
 from rig.diagnosis.problem.problem import Candidate, StrutEffect, nominal
 from rig.diagnosis.progress import Progress, within
-from rig.diagnosis.search.fit import model_for
-from rig.diagnosis.search.pool import Pool, ValidatedModel
+from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
+from rig.diagnosis.search.fit import law_values, model_for
+from rig.diagnosis.search.pool import FULL, Pool, ValidatedModel
 from rig.diagnosis.search.score_test import ModelChange
 from rig.diagnosis.search.screen import (
     Screening,
@@ -26,6 +29,8 @@ from rig.diagnosis.search.screen import (
 )
 
 LawCombination = TypeVar("LawCombination", Screening, ModelChange)
+_IMITATED = ("friction", "nonlinear_damping", "hysteresis")
+"""Families of which one law may imitate friction beside the valves of a damper."""
 _EXPLORED = 0.85
 """Share of a search's progress that its rounds take; in the rest the best models converge."""
 
@@ -47,6 +52,7 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
         _expand_best(pool, progress)
     else:
         first = _search_along_motion(pool, progress)
+    _try_damper_with_friction(pool)
     pool.converge_best()
     return first
 
@@ -82,6 +88,23 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         if pool.at_floor(pool.converge_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
     return first
+
+
+def _try_damper_with_friction(pool: Pool) -> None:
+    """Fit friction and a damper with valves in place of the best model's damper or friction."""
+    best = pool.least()
+    if pool.at_floor(best):
+        return
+    laws = best.fit.candidate.new
+    for strut in {strut for strut, name in laws if effect(name).family in _IMITATED}:
+        others = [law for law in laws if law[0] != strut or effect(law[1]).family not in _IMITATED]
+        if len(others) + 2 > pool.criteria.most_laws:
+            continue
+        known = law_values(pool.problem, best.fit)
+        base = Screening(tuple(others), tuple(known[law] for law in others), 0.0, np.zeros(1))
+        screening = screen_damper_with_friction(pool.linear_stage, base, strut)
+        if screening is not None:
+            pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
 
 
 def _screen_single_laws(pool: Pool, progress: Progress) -> FirstRound:

@@ -306,7 +306,7 @@ def candidate_laws(problem: Problem) -> list[StrutEffect]:
     ]
 
 
-class _Round(NamedTuple):
+class Round(NamedTuple):
     """One law more for a combination: what the comparison of all starts shares.
 
     Attributes:
@@ -337,12 +337,13 @@ class _Round(NamedTuple):
         return refine(self.stage, screening.laws, screening.values)
 
 
-def _begin_round(stage: Stage, base: Screening) -> _Round:
+def begin_round(stage: Stage, base: Screening) -> Round:
+    """What the comparison of further laws for a combination shares."""
     coarse = stage.coarse or stage
     columns = _law_tangents(coarse, base)
     basis = np.linalg.qr(columns)[0] if columns.shape[1] else columns
     residual = _residual(coarse, base.laws, base.values)
-    return _Round(stage, coarse, base, residual - basis @ (basis.T @ residual), basis)
+    return Round(stage, coarse, base, residual - basis @ (basis.T @ residual), basis)
 
 
 def rank_laws(
@@ -353,7 +354,7 @@ def rank_laws(
     laws = [at for at in laws if is_compatible(at, base.laws)]
     for _, name in laws:
         compile_law(name)  # Compiled here: numba's compiler is not thread-safe.
-    this = _begin_round(stage, base)
+    this = begin_round(stage, base)
     with ThreadPoolExecutor(cpu_count()) as pool:
         starts = list(pool.map(lambda at: this.starts(at, MappingProxyType({})), laws))
         order = sorted((s[0][0], i) for i, s in enumerate(starts) if s)
@@ -443,7 +444,7 @@ def _reads_velocity_alone(name: str) -> bool:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.
-def _evaluate_start(this: _Round, at: StrutEffect, start: Array) -> _Start | None:
+def _evaluate_start(this: Round, at: StrutEffect, start: Array) -> _Start | None:
     """Cost and parameters of a law at a start, its size by least squares where it has one."""
     column = response(this.coarse, at, start)
     column = column - this.basis @ (this.basis.T @ column)
