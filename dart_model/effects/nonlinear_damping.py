@@ -111,12 +111,11 @@ def _valves(
 ) -> float:
     if velocity_m_per_s > 0.0:
         ratio = velocity_m_per_s / rebound_knee_m_per_s
-        added, lost = added_rebound_n_s_per_m, lost_rebound_n_s_per_m
-    else:
-        ratio = -velocity_m_per_s / compression_knee_m_per_s
-        added, lost = 0.0, lost_compression_n_s_per_m
+        share = 1.0 - (1.0 + ratio**sharpness) ** (-1.0 / sharpness)
+        return (lost_rebound_n_s_per_m * share - added_rebound_n_s_per_m) * velocity_m_per_s
+    ratio = -velocity_m_per_s / compression_knee_m_per_s
     share = 1.0 - (1.0 + ratio**sharpness) ** (-1.0 / sharpness)
-    return (lost * share - added) * velocity_m_per_s
+    return lost_compression_n_s_per_m * share * velocity_m_per_s
 
 
 def _over_stroke(

@@ -99,16 +99,9 @@ def _simpler_models(
 ) -> Iterable[ValidatedModel]:
     """Models without a law of a chosen one, or with a simpler one for it; fitted on demand."""
     stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
-    laws = chosen.fit.candidate.new
     less = chosen.fit.candidate.without(law)
 
-    @cache
-    def most() -> float:
-        """Largest promising cost along the motion, where a fit costs little."""
-        screening = refine(stage, laws, [known[other] for other in laws])
-        criteria, lawless = pool.criteria, no_law(stage).validation_cost
-        near = 0.0 if screening is None else criteria.hopeless * screening.validation_cost
-        return max(near, criteria.formula**2 * lawless)
+    most = cache(lambda: _most_promising_cost(pool, chosen))
 
     def is_promising(screening: Screening | None) -> bool:
         return screening is not None and screening.validation_cost <= most()
@@ -134,6 +127,15 @@ def _simpler_models(
         yield from _converge_candidate(pool, candidate, chosen)
 
 
+def _most_promising_cost(pool: Pool, model: ValidatedModel) -> float:
+    """Largest cost along the motion, where a fit costs little, of laws that may replace others."""
+    stage, known = pool.linear_stage, law_values(pool.problem, model.fit)
+    screening = refine(stage, tuple(known), list(known.values()))
+    criteria, lawless = pool.criteria, no_law(stage).validation_cost
+    near = 0.0 if screening is None else criteria.hopeless * screening.validation_cost
+    return max(near, criteria.formula**2 * lawless)
+
+
 def _as_screening(laws: Sequence[StrutEffect], known: Mapping[StrutEffect, Array]) -> Screening:
     """Fitted laws as a combination to which others are added."""
     return Screening(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
@@ -151,7 +153,10 @@ def _converge_candidate(
 
 def _attempt_plainer(pool: Pool, unidentified: ValidatedModel) -> None:
     """Fit laws of the same families with fewer parameters, of which data determine more."""
-    known = law_values(pool.problem, unidentified.fit)
+    known, most = (
+        law_values(pool.problem, unidentified.fit),
+        _most_promising_cost(pool, unidentified),
+    )
     for law in unidentified.fit.candidate.new:
         less = unidentified.fit.candidate.without(law).new
         base = _as_screening(less, known)
@@ -159,7 +164,7 @@ def _attempt_plainer(pool: Pool, unidentified: ValidatedModel) -> None:
         for screening in rank_laws(pool.linear_stage, base, len(plainer), plainer)[
             : pool.criteria.fitted_a_size
         ]:
-            if screening.values:
+            if screening.values and screening.validation_cost <= most:
                 pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
 
 
