@@ -53,6 +53,7 @@ def print_end(
     _refuse_bad_end(plan, ended)
     if plan.has_force and (gaps := _gaps_of(ended, folder)) is not None:
         print_text(gaps.report(folder.name), "yellow")
+    _print_stated_std(plan, ended, folder)
     if following:
         print_text(f"Next: `{following}`")
     if following.startswith("rig diagnose"):
@@ -67,6 +68,31 @@ def diagnosis_of(plan: "Plan", folder: Path) -> str:
     if not plan.has_force:
         return ""
     return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
+
+
+def _print_stated_std(plan: "Plan", ended: "Ended", folder: Path) -> None:
+    """Print the standard deviation that observers stated of valid estimates of a run."""
+    import numpy as np
+
+    from rig.log.errors import LogError
+    from rig.log.reader import read_run
+
+    if ended.ticks * plan.period_ns > _LONGEST_READ_S * 1e9:
+        return
+    try:
+        steps = read_run(folder).steps
+    except LogError:
+        return
+    for strut, name in zip(plan.struts, plan.strut_names, strict=True):
+        std_n = steps.column(f"{name}.force_std_n").to_numpy()
+        std_n = std_n[(steps.column(f"{name}.valid").to_numpy() == 1.0) & np.isfinite(std_n)]
+        if strut.observer.knows_std and len(std_n):
+            median_n, most_n = np.quantile(std_n, [0.5, 0.99])
+            print_text(
+                f"Standard deviation that the observer of {name} stated while valid: median "
+                f"{median_n:.3g} N, at most {most_n:.3g} N in 99 % of the ticks. A limit on "
+                "force_std_n below that makes usual estimates invalid."
+            )
 
 
 def _gaps_of(ended: "Ended", folder: Path) -> "Gaps | None":

@@ -203,6 +203,13 @@ def _find_signals(
         force: None if name == _NONE else find_force(database, force, name)
         for force, name in names.items()
     }
+    chosen_names = [choice.name for choice in forces.values() if choice]
+    if len(set(chosen_names)) < len(chosen_names):  # one signal suits both: the user decides
+        if None not in names.values():
+            raise InputError(f"--load-cell {load_cell}: is the applied force, expected another")
+        forces = {
+            force: choice if names[force] is not None else None for force, choice in forces.items()
+        }
     open_forces = [force for force, name in names.items() if name is None and not forces[force]]
     unclear = unclear_forces(database, [it for it in forces.values() if it]) if open_forces else []
     if unclear and sys.stdin.isatty():
@@ -317,8 +324,8 @@ def _print(
         print_text(f"{choice.quantity.key}: {choice.name} ({choice.comment})")
     for item in signals.unclear:
         print_text(
-            f"{item.name} is a force, and nothing says where it acts: --applied-force {item.name} "
-            f"for one on the body, --load-cell {item.name} for one in the strut"
+            f"{item.name} is a force, and it is not clear where it acts: --applied-force "
+            f"{item.name} for one on the body, --load-cell {item.name} for one in the strut"
         )
     for what, why in database.passed_over.items():
         print_text(f"Passed over in {database.path.name}: {what}: {why}")

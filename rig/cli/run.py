@@ -110,6 +110,6 @@ def _run_one(
         keep_summary(ended, folder)
     following = diagnosis_of(plan, folder)
     if listen_only:
-        other, name = ("", "tuned") if model is None else (f" --model {model}", "corrected")
+        other, name = ("", "tuned") if model is None else (f" --model {model}", "tuned-corrected")
         following = f"rig tune {config}{other} --run {folder} --out {config.with_name(name)}.yaml"
     print_end(plan, ended, folder, following, with_timing=True, as_json=as_json)

@@ -28,9 +28,6 @@ EXAMPLES = (
 )
 
 
-_PROPOSED_LIMIT = 3.0
-"""Proposed limit of the stated standard deviation over the expected RMS error of the force."""
-
 _HARDLY = 0.8
 """Share of the configured observer's expected error above which tuning hardly helps."""
 
@@ -150,7 +147,7 @@ def tune_command(
     for path in (out, plot):
         if path is not None:
             print_text(f"Written: {path}")
-    _propose_limit(plan, struts, out or config)
+    _recall_limit(plan, struts, out or config)
     if out is not None:
         print_text(f"Next: `rig run {out}`")
 
@@ -290,31 +287,27 @@ def _refuse_limits(plan: "Plan", struts: "list[TunedStrut]") -> None:
             )
 
 
-def _propose_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None:
-    """Propose a limit on the standard deviation that an observer states, where there is none."""
+def _recall_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None:
+    """Print that no stated deviation makes an estimate invalid, or which one the file keeps."""
     from rig.bridge.supervision_limits import LimitedValue
 
-    expected_n = [it.tuned.expected.force_n for it in struts if it.tuned.observer.knows_std]
-    if not expected_n:
+    if not any(it.tuned.observer.knows_std for it in struts):
         return
-    limit_n = float(f"{_PROPOSED_LIMIT * max(expected_n):.2g}")
     present_n = [
         row.high
         for row in plan.config.supervision.limits
         if row.value is LimitedValue.FORCE_STD_N and row.high is not None
     ]
     if present_n:
-        if not limit_n / 2 <= min(present_n) <= 2 * limit_n:
-            print_text(
-                f"supervision.limits in {file} keeps force_std_n at {min(present_n):g}; "
-                f"{_PROPOSED_LIMIT:g} times the expected error is now {limit_n:g}."
-            )
+        print_text(
+            f"supervision.limits in {file} keeps force_std_n at {min(present_n):g}, which suited "
+            "the former observer: compare it with the stated deviation that `rig run` reports."
+        )
         return
     print_text(
-        "An estimate remains valid however large a standard deviation it states. To hold one "
-        f"that is less certain than you accept, for example {_PROPOSED_LIMIT:g} times the "
-        f"expected error, add to supervision.limits in {file}: "
-        f"- {{value: force_std_n, high: {limit_n:g}, action: hold}}"
+        "An estimate remains valid however large a standard deviation it states. `rig run` reports "
+        f"at its end how large it was; a limit in {file} holds an estimate that is less certain: "
+        "supervision: {limits: [{value: force_std_n, high: N, action: hold}]}"
     )
 
 

@@ -190,7 +190,13 @@ def unclear_forces(database: Database, taken: Iterable[Choice]) -> list[RankedSi
         for kind in (signal_ranking.APPLIED_FORCE, signal_ranking.STRUT_FORCE)
     ]
     found = [max(same, key=lambda item: item.score) for same in zip(*ranked, strict=True)]
-    free = [item for item in found if item.name not in names and -1.0 < item.score < LIKELY]
+    likely = [{it.name for it in same if it.score >= LIKELY} for same in ranked]
+    suits_both = likely[0] & likely[1]
+    free = [
+        item
+        for item in found
+        if item.name not in names and (-1.0 < item.score < LIKELY or item.name in suits_both)
+    ]
     return sorted(free, key=lambda item: -item.score)
 
 

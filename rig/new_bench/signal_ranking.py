@@ -135,9 +135,9 @@ TEMPERATURE = Likeness(
 ESTIMATE = Likeness(
     Dimension.FORCE,
     _weights(
-        plus_3="estimate estimated estim est geschaetzt schaetz rig model simulated sim virtual "
+        plus_3="estimate estimated estim est geschaetzt schaetz rig model simulated sim "
         "calculated calc",
-        plus_1="spring damper force kraft cmd out",
+        plus_1="spring damper strut force kraft cmd out",
         minus_2="measured meas cell load ist setpoint soll max min limit right",
     ),
 )

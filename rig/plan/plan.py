@@ -390,7 +390,8 @@ def _check_calibration(entry: MeasuredSignal, quantity: Quantity, key: str) -> N
     if dimension is Dimension.LENGTH and entry.zero is None:
         raise InputError(
             f"{key}.reversed: expected zero: {{reads, at_m}} with it, because a reversed reading "
-            "alone is no length; rig zero measures it"
+            "alone is no length: leave it out, let rig zero measure the zero, and then set it if "
+            "no second length has shown the direction"
         )
 
 

@@ -57,6 +57,28 @@ def test_a_force_of_which_nothing_says_where_it_acts_is_left_to_the_user(rig, ca
     assert found["free_length_m"] == pytest.approx(0.36 + 24.0 * 9.81 / 9000.0)
 
 
+BOTH = 'CM_ SG_ 300 Force "Load cell between cylinder and carriage";\n'
+
+
+def test_a_force_that_suits_both_places_is_mapped_to_the_one_that_is_named(rig, tmp_path, capsys):
+    text = (tmp_path / "my.dbc").read_text()
+    (tmp_path / "my.dbc").write_text(text + BOTH)
+    assert rig(*FACTS, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert "CELL.Force" in found["unclear_forces"]
+    assert not {"applied_force", "load_cell_force"} & set(found["signals"])
+    for file in ("my.yaml", "my_model.yaml"):
+        (tmp_path / file).unlink()
+    assert rig(*FACTS, "--applied-force", "CELL.Force", "--load-cell", "CELL.Force") == 2
+    assert "--load-cell CELL.Force: is the applied force" in capsys.readouterr().err
+    assert rig(*FACTS, "--applied-force", "CELL.Force") == 0
+    signals = load_plan(tmp_path / "my.yaml").config.signals
+    assert signals.applied_force.signal == "Force"
+    assert [quantity.key for quantity in signals.bench if "force" in quantity.key] == [
+        "applied_force"
+    ]
+
+
 def test_what_options_leave_open_is_named(rig, capsys):
     for number in range(0, len(FACTS), 2):
         assert rig(*FACTS[:number], *FACTS[number + 2 :]) == 2
