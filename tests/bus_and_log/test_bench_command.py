@@ -2,13 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.log.reader import read_header
+from rig.log.reader import read_header, read_run
 from rig.plan.config import CONFIGS
 
 
@@ -51,6 +52,27 @@ def test_it_runs_a_bridge_with_it_without_its_bus(tmp_path):
     again = bench(*arguments)
     assert isinstance(again.exception, InputError)
     assert "expected" in str(again.exception)
+
+
+@pytest.mark.parametrize("kind", ["kalman", "pi"])
+def test_its_end_reports_the_deviation_that_an_observer_states(kind, tmp_path):
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    if kind == "kalman":
+        smoothing = {"bandwidth_hz": 20.0, "noise_std_m": 2e-5}
+        config["observers"] = {"strut": {"kind": kind, "filter": smoothing}}
+    bridge, out = tmp_path / "bridge.yaml", tmp_path / "run"
+    bridge.write_text(yaml.safe_dump(config))
+    done = bench(
+        "--bridge", str(bridge), "--lockstep", "--duration-s", "3", "--out", str(out)
+    )  # fmt: skip
+    assert done.exit_code == 0
+    said = " ".join(done.output.split())
+    assert ("observer of strut stated while valid: median" in said) is (kind == "kalman")
+    if kind == "kalman":
+        steps = read_run(out).steps
+        std_n = steps.column("strut.force_std_n").to_numpy()
+        std_n = std_n[steps.column("strut.valid").to_numpy() == 1.0]
+        assert f"median {np.median(std_n):.3g} N" in said
 
 
 @pytest.mark.parametrize(
