@@ -267,11 +267,11 @@ def _print_errors(strut: "TunedStrut") -> None:
         )
     residual_n = float(strut.expectation.power_n2.sum()) ** 0.5
     if tuned_n > residual_n:
-        print_text(
-            f"The model alone errs by less: its residual force is {residual_n:.3g} N RMS. An "
-            "observer then only guards against a change of the bench; with a longer --settling-s "
-            "it adds less noise to the force."
-        )
+        text = f"The model alone errs by less: its residual force is {residual_n:.3g} N RMS. An "
+        text += "observer then only guards against a change of the bench"
+        if strut.tuned.expected.settling_s > 0.9 * strut.tuned.required_settling_s:
+            text += "; with a longer --settling-s it adds less noise to the force"
+        print_text(f"{text}.")
 
 
 def _refuse_limits(plan: "Plan", struts: "list[TunedStrut]") -> None:
