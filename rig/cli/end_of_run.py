@@ -77,16 +77,17 @@ def _print_stated_std(plan: "Plan", ended: "Ended", folder: Path) -> None:
     from rig.log.errors import LogError
     from rig.log.reader import read_run
 
-    if ended.ticks * plan.period_ns > _LONGEST_READ_S * 1e9:
+    stating = [it.name for it in plan.struts if it.observer.knows_std]
+    if not stating or ended.ticks * plan.period_ns > _LONGEST_READ_S * 1e9:
         return
     try:
         steps = read_run(folder).steps
     except LogError:
         return
-    for strut, name in zip(plan.struts, plan.strut_names, strict=True):
+    for name in stating:
         std_n = steps.column(f"{name}.force_std_n").to_numpy()
         std_n = std_n[(steps.column(f"{name}.valid").to_numpy() == 1.0) & np.isfinite(std_n)]
-        if strut.observer.knows_std and len(std_n):
+        if len(std_n):
             median_n, most_n = np.quantile(std_n, [0.5, 0.99])
             print_text(
                 f"Standard deviation that the observer of {name} stated while valid: median "

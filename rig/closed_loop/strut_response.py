@@ -56,16 +56,16 @@ def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int)
     return StrutResponse(mobility, -stiffness, -damping)
 
 
-def driving_speeds_m_per_s(plant: AnyPlant, heights_m: Sequence[float]) -> list[float | None]:
+def find_driving_speeds_m_per_s(plant: AnyPlant, heights_m: Sequence[float]) -> list[float | None]:
     """The lowest speed of each strut at which its force drives the motion; None without one.
 
     The force at a velocity, less that at rest, has to be against it in a passive strut (van der
     Schaft, L2-Gain and Passivity Techniques in Nonlinear Control, 2017, 2).
     """
-    return [_driving_speed(plant, heights_m, index) for index in range(plant.struts)]
+    return [_find_driving_speed(plant, heights_m, index) for index in range(plant.struts)]
 
 
-def _driving_speed(plant: AnyPlant, heights_m: Sequence[float], index: int) -> float | None:
+def _find_driving_speed(plant: AnyPlant, heights_m: Sequence[float], index: int) -> float | None:
     def force_n(velocity_m_per_s: float) -> float:
         velocities = (velocity_m_per_s * np.eye(plant.struts)[index]).tolist()
         state = plant.init(list(heights_m), velocities)

@@ -20,7 +20,7 @@ from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
-from rig.closed_loop.strut_response import driving_speeds_m_per_s
+from rig.closed_loop.strut_response import find_driving_speeds_m_per_s
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, vital_channels
@@ -474,7 +474,7 @@ def _load(plan: Plan) -> Finding:
 
 def _dissipation(plan: Plan, plant: AnyPlant) -> list[Finding]:
     """Struts whose force drives the motion above some speed: a disturbed model runs away there."""
-    speeds = driving_speeds_m_per_s(plant, [strut.free_length_m for strut in plan.struts])
+    speeds = find_driving_speeds_m_per_s(plant, [strut.free_length_m for strut in plan.struts])
     return [
         Finding(
             Severity.WARNING,

@@ -1,7 +1,7 @@
 """A start for friction and the valves of a damper together, along the motion.
 
-A damper law that rises steeply from rest imitates the friction beside it, and the other way round:
-from either alone, or from both one after the other, a fit ends in the valley of the imitation. At
+A damper law that rises steeply from rest imitates friction, and friction such a damper: from either
+alone, or from both one after the other, a fit ends in the valley of the imitation. At
 given knees the force of both is linear in its four sizes, so that these have no valley.
 """
 
@@ -18,7 +18,6 @@ from rig.diagnosis.search.screen import (
     begin_round,
     law_starts,
     refine,
-    response,
     scale_law,
 )
 
@@ -28,6 +27,7 @@ _FRICTION, _DAMPER = "elastoplastic_friction", "valve_damping"
 _KNEES = (0.15, 0.4, 1.0)
 """Velocities of the knees, as shares of the RMS velocity, that are tried in each direction."""
 _SHARPNESS = 3.0
+"""Of the knees at first, as in the starts of the law: between rounded (2) and sharp (12)."""
 
 
 def screen_damper_with_friction(stage: Stage, base: Screening, strut: int) -> Screening | None:
@@ -53,14 +53,10 @@ def _best_values(
     speed = stage.problem.motions[at[1][0]].speed_m_per_s
     knees = [share * speed for share in _KNEES]
 
-    def column(law: StrutEffect, values: Array) -> Array:
-        force = response(this.coarse, law, values)
-        return force - this.basis @ (this.basis.T @ force)
-
-    friction = column(at[0], dry)
-    added = column(at[1], _valves((0.0, 1.0, 0.0), speed, speed))
-    compression = [column(at[1], _valves((1.0, 0.0, 0.0), knee, knee)) for knee in knees]
-    rebound = [column(at[1], _valves((0.0, 0.0, 1.0), knee, knee)) for knee in knees]
+    friction = this.column(at[0], dry)
+    added = this.column(at[1], _valves((0.0, 1.0, 0.0), speed, speed))
+    compression = [this.column(at[1], _valves((1.0, 0.0, 0.0), knee, knee)) for knee in knees]
+    rebound = [this.column(at[1], _valves((0.0, 0.0, 1.0), knee, knee)) for knee in knees]
     best, least = None, np.inf
     for i, j in itertools.product(range(len(knees)), repeat=2):
         columns = np.column_stack([friction, compression[i], added, rebound[j]])

@@ -9,8 +9,6 @@ References:
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-
 from dart_model.effects import effect
 from rig.diagnosis.problem.problem import Candidate, StrutEffect, nominal
 from rig.diagnosis.progress import Progress, within
@@ -21,6 +19,7 @@ from rig.diagnosis.search.score_test import ModelChange
 from rig.diagnosis.search.screen import (
     Screening,
     Stage,
+    as_screening,
     best_of_each,
     no_law,
     rank_laws,
@@ -30,7 +29,7 @@ from rig.diagnosis.search.screen import (
 
 LawCombination = TypeVar("LawCombination", Screening, ModelChange)
 _IMITATED = ("friction", "nonlinear_damping", "hysteresis")
-"""Families of which one law may imitate friction beside the valves of a damper."""
+"""Families of which one law may imitate friction together with the valves of a damper."""
 _EXPLORED = 0.85
 """Share of a search's progress that its rounds take; in the rest the best models converge."""
 
@@ -91,17 +90,17 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
 
 
 def _try_damper_with_friction(pool: Pool) -> None:
-    """Fit friction and a damper with valves in place of the best model's damper or friction."""
+    """Fit friction and a damper with valves instead of the best model's damper or friction."""
     best = pool.least()
     if pool.at_floor(best):
         return
     laws = best.fit.candidate.new
-    for strut in {strut for strut, name in laws if effect(name).family in _IMITATED}:
-        others = [law for law in laws if law[0] != strut or effect(law[1]).family not in _IMITATED]
+    imitating = [law for law in laws if effect(law[1]).family in _IMITATED]
+    for strut in {strut for strut, _ in imitating}:
+        others = [law for law in laws if law[0] != strut or law not in imitating]
         if len(others) + 2 > pool.criteria.most_laws:
             continue
-        known = law_values(pool.problem, best.fit)
-        base = Screening(tuple(others), tuple(known[law] for law in others), 0.0, np.zeros(1))
+        base = as_screening(others, law_values(pool.problem, best.fit))
         screening = screen_damper_with_friction(pool.linear_stage, base, strut)
         if screening is not None:
             pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)

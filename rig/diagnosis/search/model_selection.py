@@ -1,6 +1,6 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -14,7 +14,14 @@ from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel
-from rig.diagnosis.search.screen import Screening, candidate_laws, no_law, rank_laws, refine
+from rig.diagnosis.search.screen import (
+    Screening,
+    as_screening,
+    candidate_laws,
+    no_law,
+    rank_laws,
+    refine,
+)
 from rig.diagnosis.search.validity import find_unidentifiable_law
 
 Array = NDArray[np.float64]
@@ -121,7 +128,7 @@ def _simpler_models(
             continue
         candidate = less.with_effects(other)
         if candidate not in pool.fits:
-            for screening in rank_laws(stage, _as_screening(less.new, known), 1, [other]):
+            for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
                 if screening.values and is_promising(screening):
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
         yield from _converge_candidate(pool, candidate, chosen)
@@ -136,11 +143,6 @@ def _most_promising_cost(pool: Pool, model: ValidatedModel) -> float:
     return max(near, criteria.formula**2 * lawless)
 
 
-def _as_screening(laws: Sequence[StrutEffect], known: Mapping[StrutEffect, Array]) -> Screening:
-    """Fitted laws as a combination to which others are added."""
-    return Screening(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
-
-
 def _converge_candidate(
     pool: Pool, candidate: Candidate, chosen: ValidatedModel
 ) -> Iterable[ValidatedModel]:
@@ -153,13 +155,11 @@ def _converge_candidate(
 
 def _attempt_plainer(pool: Pool, unidentified: ValidatedModel) -> None:
     """Fit laws of the same families with fewer parameters, of which data determine more."""
-    known, most = (
-        law_values(pool.problem, unidentified.fit),
-        _most_promising_cost(pool, unidentified),
-    )
+    known = law_values(pool.problem, unidentified.fit)
+    most = _most_promising_cost(pool, unidentified)
     for law in unidentified.fit.candidate.new:
         less = unidentified.fit.candidate.without(law).new
-        base = _as_screening(less, known)
+        base = as_screening(less, known)
         plainer = [at for at in candidate_laws(pool.problem) if _is_plainer(at, law)]
         for screening in rank_laws(pool.linear_stage, base, len(plainer), plainer)[
             : pool.criteria.fitted_a_size

@@ -39,7 +39,7 @@ from rig.diagnosis.search.screen import (
     stage_of,
     whole_stage_of,
 )
-from rig.diagnosis.search.validity import find_defect, smooth_tracks
+from rig.diagnosis.search.validity import find_defect, new_laws, smooth_tracks
 
 Array = NDArray[np.float64]
 
@@ -291,8 +291,8 @@ class Pool:
             larger.size > smaller.size
             and self.is_formula(smaller)
             and not _adds_a_kind(smaller, larger)
-            and not self.adds_dry_friction(smaller, larger)
             and not self.is_imitated(larger, smaller)
+            and not self.adds_dry_friction(smaller, larger)
         ):
             return False
         # A law has to gain its share; a better formula for one need only be better.
@@ -333,11 +333,7 @@ class Pool:
         few, many = Counter(smaller.families), Counter(larger.families)
         if many - few != Counter(["friction"]) or few - many or "friction" in few:
             return False
-        (row,) = (
-            len(larger.fit.candidate.kept) + i
-            for i, (_, name) in enumerate(larger.fit.candidate.new)
-            if effect(name).family == "friction"
-        )
+        (row,) = (row for row, name in new_laws(larger.fit) if effect(name).family == "friction")
         strut, force = forces_along(self.problem, larger.fit.model, self.along)[row]
         speed = np.concatenate([np.abs(track.velocities_m_per_s[strut]) for _, track in self.along])
         share = speed / max(float(np.sqrt(np.mean(speed**2))), 1e-100)

@@ -288,6 +288,11 @@ def no_law(stage: Stage) -> Screening:
     return Screening((), (), cost, _block_costs(stage, stage.target, None))
 
 
+def as_screening(laws: Sequence[StrutEffect], known: Mapping[StrutEffect, Array]) -> Screening:
+    """Fitted laws as a combination to which others are added."""
+    return Screening(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
+
+
 def _block_costs(stage: Stage, residual: Array, jacobian: Array | None) -> Array:
     if jacobian is None:
         count = int(stage.blocks.max()) + 1
@@ -319,6 +324,11 @@ class Round(NamedTuple):
     base: Screening
     residual: Array
     basis: Array
+
+    def column(self, at: StrutEffect, values: Array) -> Array:
+        """Response of a law on the coarse regression, tangents projected out, shape (m,)."""
+        column = response(self.coarse, at, values)
+        return column - self.basis @ (self.basis.T @ column)
 
     def starts(self, at: StrutEffect, known: Mapping[str, float]) -> list[_Start]:
         """Starts of a law, best first."""
@@ -446,8 +456,7 @@ def _reads_velocity_alone(name: str) -> bool:
 @np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.
 def _evaluate_start(this: Round, at: StrutEffect, start: Array) -> _Start | None:
     """Cost and parameters of a law at a start, its size by least squares where it has one."""
-    column = response(this.coarse, at, start)
-    column = column - this.basis @ (this.basis.T @ column)
+    column = this.column(at, start)
     power = float(column @ column)
     if not np.isfinite(power) or power <= 0.0:
         return None

@@ -49,7 +49,7 @@ def find_defect(
     )
 
 
-def _new(result: Fit) -> list[tuple[int, str]]:
+def new_laws(result: Fit) -> list[tuple[int, str]]:
     """Index among all effects, and name, of those that the nominal model lacks."""
     first = len(result.candidate.kept)
     return [(first + i, name) for i, (_, name) in enumerate(result.candidate.new)]
@@ -64,7 +64,7 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
     nuisance = jacobian[:, linear | starts]
     nuisance = nuisance[:, np.linalg.norm(nuisance, axis=0) > 0.0]
     basis = np.linalg.qr(nuisance / np.linalg.norm(nuisance, axis=0))[0]
-    for row, name in _new(result):
+    for row, name in new_laws(result):
         scaled = variables[row][list(effect(name).scaled)]
         if not len(scaled):
             continue
@@ -91,7 +91,7 @@ def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
     sizes = np.where(
         space.logarithmic, np.log(UNBOUND), np.abs(result.solution.values) / space.scale
     )
-    for row, name in _new(result):
+    for row, name in new_laws(result):
         scaled = variables[row][list(effect(name).scaled or (0,))]
         if not np.any(half[scaled] < sizes[scaled]):
             return f"its size is not identifiable from these data ({name})"
@@ -105,7 +105,7 @@ def _find_linear_law(
     criteria: SelectionCriteria,
 ) -> str | None:
     """Reason against a law that is a linear spring and damper along this motion."""
-    for row, name in _new(result):
+    for row, name in new_laws(result):
         strut, force = forces[row]
         basis = linear_forces(along, strut)
         nonlinear = force - basis @ (basis.T @ force)
@@ -119,7 +119,7 @@ def _find_cancelling_laws(
     result: Fit, forces: list[tuple[int, Array]], criteria: SelectionCriteria
 ) -> str | None:
     """Reason against two laws of one strut whose forces cancel each other."""
-    new = _new(result)
+    new = new_laws(result)
     for i, (row, name) in enumerate(new):
         for other_row, other in new[i + 1 :]:
             (strut, force), (other_strut, other_force) = forces[row], forces[other_row]
