@@ -330,8 +330,8 @@ def _print(
     for what, why in database.passed_over.items():
         print_text(f"Passed over in {database.path.name}: {what}: {why}")
     print_text(
-        f"Model: {model.mass_kg:g} kg, stiffness {model.stiffness_n_per_m:.4g} N/m, damping "
-        f"{model.damping_n_s_per_m:.4g} N·s/m ({source}), free length {model.free_length_m:.4g} m"
+        f"Model: {model.mass_kg:g} kg, stiffness {model.stiffness_n_per_m:.0f} N/m, damping "
+        f"{model.damping_n_s_per_m:.0f} N·s/m ({source}), free length {model.free_length_m:.4g} m"
     )
     print_text(f"Written: {out}, {model_file}. Read them.")
     print_text(

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
+from datetime import timedelta
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -86,15 +87,17 @@ def progress_bar() -> Generator[Callable[[str, float], None]]:
 
 
 def _plain_progress() -> Callable[[str, float], None]:
-    """Lines such as "  12 % reading"; none for work that takes less than two seconds."""
-    due_s = time.monotonic() + _PLAIN_PROGRESS_S
+    """Lines such as "  12 % 0:01:05 reading"; none for work of less than two seconds."""
+    first_s = time.monotonic()
+    due_s = first_s + _PLAIN_PROGRESS_S
 
     def show(what: str, share: float) -> None:
         nonlocal due_s
         now_s = time.monotonic()
         if now_s >= due_s:
             due_s = now_s + _PLAIN_PROGRESS_S
-            _write(f"{100 * share:4.0f} % {what}\n".encode())
+            elapsed = timedelta(seconds=int(now_s - first_s))
+            _write(f"{100 * share:4.0f} % {elapsed} {what}\n".encode())
 
     return show
 

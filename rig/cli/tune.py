@@ -222,6 +222,8 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
     )
     print_text(f"Poles, the slowest first: {slowest}.")
     print_text(f"observers.{strut.name}: {settings_of(chosen.observer)}")
+    if strut.latency is not None and strut.delay_s:
+        print_text(f"signals.height.{strut.name}.delay_s: {strut.delay_s:g}")
     if chosen.expected.damping_ratio < 0.99 * damping_ratio:
         console.print(
             f"No gains keep a damping ratio of {damping_ratio:g}; the best "

@@ -35,8 +35,19 @@ TareOf = Annotated[
     typer.Option(
         "--tare",
         metavar="CHANNEL",
-        help="Force sensor whose tare is measured while no force acts on it: applied_force, "
-        "load_cell_force, or STRUT.SENSOR of a further sensor.",
+        help="Force sensor whose tare is measured: applied_force, load_cell_force, or "
+        "STRUT.SENSOR of a further sensor. No force may act on it, unless --force-n states it.",
+    ),
+]
+ForceNow = Annotated[
+    float | None,
+    typer.Option(
+        "--force-n",
+        metavar="N",
+        min=-1e7,
+        max=1e7,
+        help="With --tare: present force on the sensor, such as that of a weight or of a constant "
+        "set point, with the sign of the channel.",
     ),
 ]
 ListenSeconds = Annotated[
@@ -52,6 +63,7 @@ def zero_command(
     strut: StrutName = None,
     length_m: LengthNow = None,
     tare: TareOf = None,
+    force_n: ForceNow = None,
     listen_s: ListenSeconds = 2.0,
     run: FromRun = None,
     is_remounted: Annotated[
@@ -74,12 +86,14 @@ def zero_command(
 
     if (length_m is None) == (tare is None):
         raise InputError("expected one of --length-m and --tare")
+    if force_n is not None and tare is None:
+        raise InputError(f"--force-n {force_n:g}: expected --tare CHANNEL with it")
     plan = load_plan(config)
     channel = _channel(plan, strut, tare)
     readings = _read(as_read(plan), channel.name, listen_s, run)
     before = entry_of(plan, channel)
     if length_m is None:
-        found = find_tare(readings)
+        found = find_tare(readings, force_n or 0.0, before)
     else:
         found = find_zero(readings, length_m, before, is_remounted=is_remounted)
     write_mounting(plan, channel, found)

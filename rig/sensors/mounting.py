@@ -203,9 +203,10 @@ def _scale(reads: float, length_m: float, last: Zero) -> float | None:
     return scale
 
 
-def find_tare(readings: Readings) -> Mounting:
-    """The tare of a force's sensor that nothing pulls or pushes."""
-    return Mounting({"tare_n": round(readings.mean, 4)})
+def find_tare(readings: Readings, force_n: float, before: MeasuredSignal) -> Mounting:
+    """The tare of a force's sensor on which a known force acts, in N by the channel's sign."""
+    acting_n = -force_n if before.reversed else force_n
+    return Mounting({"tare_n": round(readings.mean - acting_n, 4)})
 
 
 def write_mounting(plan: Plan, channel: Channel, mounting: Mounting) -> None:

@@ -115,10 +115,24 @@ def test_a_tare_is_what_the_cell_reads(tmp_path, runs):
     assert entry["tare_n"] == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_force_that_acts_is_no_tare(tmp_path, runs, is_reversed):
+    path = config(tmp_path)
+    mark = f"load_cell_force: {{reversed: {str(is_reversed).lower()}, "
+    path.write_text(path.read_text().replace("load_cell_force: {", mark))
+    found = zero(path, "--tare", "load_cell_force", "--force-n", 40, "--run", runs[0.30])
+    assert found.exit_code == 0, found.output
+    plan = load_plan(path)
+    (cell,) = (it for it in plan.config.signals.bench.values() if it.tare_n is not None)
+    # The cell reads nothing at present, which is 40 N.
+    assert cell.calibration.apply(0.0) == pytest.approx(40.0, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         ((), "expected one of --length-m and --tare"),
+        (("--length-m", 0.3, "--force-n", 40), "--force-n 40: expected --tare CHANNEL with it"),
         (("--length-m", 0.3, "--tare", "load_cell_force"), "expected one of"),
         (("--tare", "temperature"), "--tare temperature: is no force"),
         (("--tare", "strut"), "--tare strut: is no force, expected --length-m"),
