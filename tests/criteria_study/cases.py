@@ -36,6 +36,13 @@ class Driven(dyno.Nothing):
         return 1500.0 * v / (1.0 + (v / 0.1) ** 2)
 
 
+class Regressive(dyno.Nothing):
+    """Damping of 900 N·s/m that turns into -300 at 0.1 m/s: the damper drives from 0.4 m/s on."""
+
+    def force(self, t, z, v, state, warm):
+        return math.copysign(1200.0 * max(abs(v) - 0.1, 0.0), v)
+
+
 class Cogging(dyno.Nothing):
     """A force that no law of the catalogue gives."""
 
@@ -131,6 +138,10 @@ CASES = {
         "not_explained", (), _on_dyno, _HARDENING, Sum(_HARDENING, Cogging(40.0))
     ),
     "driven": _case("not_explained", (), _on_dyno, Driven()),
+    # Dissipates at the recorded velocities alone.
+    "driven_if_faster": _case(
+        "partly_explained", ["nonlinear_damping"], _on_dyno, Regressive()
+    ),
     "outside": _case("not_explained", (), _on_dyno, Cogging(40.0)),
 }  # fmt: skip
 

@@ -33,6 +33,7 @@ ABSURD = [
     ("leftover", 1.0, "hardening"),
     ("passive", -1.0, "hardening"),
     ("passive", 1e9, "driven"),
+    ("dissipating_to", 1.0, "driven_if_faster"),
     ("explained", 1e-3, "hardening"),
     ("explained", 1e9, "most_left"),
     ("partly", 1.5, "some_left"),
@@ -49,7 +50,7 @@ def usual(case):
 
 
 def test_every_criterion_has_an_absurd_value():
-    absurd = {name for name, _, _ in ABSURD} | {"beam", "formula", "imitation"}
+    absurd = {name for name, _, _ in ABSURD} | {"beam", "formula", "imitation", "slow", "dry"}
     assert absurd == {field.name for field in fields(CRITERIA)}
 
 

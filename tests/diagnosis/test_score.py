@@ -1,6 +1,7 @@
 """The score test about a fitted model: what it promises, and what it sees beside dry friction."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool
 from rig.diagnosis.search.score_test import find_changes
 from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law
+from tests.criteria_study.cases import Regressive
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.test_planted_effects import FrictionAndHardening, FrictionAndValves
 from tests.diagnosis.test_prescribed import Orifice
@@ -32,13 +34,6 @@ def with_laws(pool, **laws):
     candidate = nominal(pool.problem).with_effects(*at)
     pool.attempt(model_for(pool.problem, pool.linear.fit, candidate, at), FULL)
     return pool.fits[candidate].fit
-
-
-class Regressive(little_dyno.Nothing):
-    """Damping of 900 N·s/m that turns into -300 at 0.1 m/s: the damper drives from 0.4 m/s on."""
-
-    def force(self, t, z, v, state, warm):
-        return math.copysign(1200.0 * max(abs(v) - 0.1, 0.0), v)
 
 
 def test_a_damper_that_drives_beyond_the_recorded_velocities_is_not_valid():
@@ -62,6 +57,21 @@ def test_friction_and_valves_begin_where_the_motion_shows_both():
         shown = effect("valve_damping").force(v, *valves) - damping * v
         true = FrictionAndValves().force(0.0, 0.0, v, ()) + math.copysign(6.0, v)
         assert shown == pytest.approx(true, abs=0.1 * 0.4 * little_bench.DAMPING)
+
+
+@pytest.mark.parametrize(
+    ("absurd", "is_named"), [({}, True), ({"dry": 1e9}, False), ({"slow": 0.0}, False)]
+)
+def test_beside_a_damper_friction_is_named_for_what_it_does_at_low_velocity(absurd, is_named):
+    pool = pool_of(little_bench, FrictionAndValves())
+    screening = screen_damper_with_friction(pool.linear_stage, no_law(pool.linear_stage), 0)
+    pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
+    (both,) = (model for model in pool.fits.values() if model.size == 2)
+    friction = next(law for law in both.fit.candidate.new if law[1] != "valve_damping")
+    damper = both.fit.candidate.without(friction)
+    pool.attempt(model_for(pool.problem, both.fit, damper))
+    pool.criteria = replace(CRITERIA, **absurd)
+    assert pool.adds_dry_friction(pool.fits[damper], both) is is_named
 
 
 def test_a_start_for_friction_needs_friction():

@@ -60,6 +60,12 @@ class SelectionCriteria:
             less (class 0.5 of ISO 7500-1 is half a percent).
         passive: Share of the largest dissipated power that a corrected strut may feed in, a
             tolerance for the rounding of a fit.
+        dissipating_to: Multiple of the largest recorded velocity up to which a corrected strut has
+            to dissipate: where its force drives, a model that an observer disturbs does not come
+            back. Ten times the speeds of a test are beyond any bench.
+        slow: Velocity, as a share of its RMS, below which a damper hardly acts, but friction does.
+        dry: Share of its force at usual velocities that friction has there, at least; what
+            corrects the formula of a damper grows with velocity, to a fifth of it.
         explained: Multiple of the noise floor that a right model does not exceed on held-out data:
             the scatter of an RMS over some hundred independent samples.
         partly: Share by which laws have to reduce the RMS error of the best linear model on
@@ -86,6 +92,9 @@ class SelectionCriteria:
     cancelling: float = -0.9
     leftover: float = 0.005
     passive: float = 0.02
+    dissipating_to: float = 10.0
+    slow: float = 0.2
+    dry: float = 0.5
     explained: float = 1.2
     partly: float = 0.25
     white: float = 0.001

@@ -54,9 +54,8 @@ FINAL = Effort(15, 1e-6, 2)
 """The fit that is reported; that of a free run once more with finer steps."""
 
 
-_SLOW, _DRY = (0.02, 0.2), 0.5
-"""Velocities, as shares of their RMS, at which dry friction has at least this share of its force at
-usual ones. What corrects the formula of a damper grows with velocity there."""
+_REVERSING = 0.02
+"""Velocity, as a share of its RMS, below which friction changes its sign."""
 
 
 class ValidatedModel(NamedTuple):
@@ -337,11 +336,12 @@ class Pool:
         strut, force = forces_along(self.problem, larger.fit.model, self.along)[row]
         speed = np.concatenate([np.abs(track.velocities_m_per_s[strut]) for _, track in self.along])
         share = speed / max(float(np.sqrt(np.mean(speed**2))), 1e-100)
-        slow, usual = (share > _SLOW[0]) & (share < _SLOW[1]), share >= 1.0
+        slow = (share > _REVERSING) & (share < self.criteria.slow)
+        usual = share >= 1.0
         if not (np.any(slow) and np.any(usual)):
             return False
         force = np.abs(force)
-        return float(np.mean(force[slow])) > _DRY * float(np.mean(force[usual]))
+        return float(np.mean(force[slow])) > self.criteria.dry * float(np.mean(force[usual]))
 
     def is_near(self, model: ValidatedModel, best: ValidatedModel) -> bool:
         """Whether a model's cost is not hopeless compared with the best one's."""

@@ -20,9 +20,8 @@ Array = NDArray[np.float64]
 
 _CELLS = 12
 """Cells of height and of velocity in which power is evaluated."""
-_FASTER = np.geomspace(1.25, 10.0, 8)
-"""Multiples of the largest recorded velocity at which a strut has to dissipate too: where its force
-drives, a model that an observer disturbs never comes back."""
+_VELOCITIES = 8
+"""Velocities beyond the recorded ones at which power is evaluated."""
 _TINY = 1e-100
 """Least divisor."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
@@ -148,7 +147,8 @@ def _find_active_strut(
         if float(power.max()) > tolerance:
             return f"strut {name} would feed energy in (not passive)"
         heights = z[np.unique(_cell(z), return_index=True)[1]]
-        faster = float(np.abs(w).max()) * np.concatenate([-_FASTER, _FASTER])
+        faster = float(np.abs(w).max()) * np.geomspace(1.0, criteria.dissipating_to, _VELOCITIES)
+        faster = np.concatenate([-faster, faster])
         power = _damper_power(problem, result, strut, *map(np.ravel, np.meshgrid(heights, faster)))
         if float(power.max()) > tolerance:
             return f"strut {name} would feed energy in at higher velocities (not passive)"
