@@ -28,7 +28,7 @@ def compare_command(
         list[float] | None,
         typer.Option(
             metavar="NUMBER",
-            help="Pressure, clicks or °C of a state; once for each state, in order.",
+            help="Pressure, clicks or °C of a state; once for each RUN, in the same order.",
         ),
     ] = None,
     strut: StrutOfRun = None,
