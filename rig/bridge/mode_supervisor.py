@@ -109,8 +109,8 @@ class Supervision(BaseModel):
 
     Attributes:
         stale_after_s: Age of a height (on a dyno also of the load cell's force) from which the
-            estimate is invalid (HOLD). For the applied force it is three of its cycles, if that is
-            longer.
+            estimate is invalid (HOLD). For the applied force, the age is three cycles of its
+            message, if these are longer.
         safe_after_s: Age of a height, of the applied force or (on a dyno) of the load cell's force
             from which the bridge enters the safe state. If three cycles of the applied force are
             longer than `stale_after_s`, they extend this age, too, by the difference.

@@ -35,7 +35,9 @@ def demo(
     ] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="New folder; by default rig-demo, or rig-demo-2, ..."),
+        typer.Option(
+            metavar="DIR", help="New folder; by default rig-demo, or if it exists rig-demo-2, ..."
+        ),
     ] = None,
     lockstep: Annotated[
         bool,

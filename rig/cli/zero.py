@@ -64,7 +64,7 @@ def zero_command(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Measure a sensor's zero, direction or tare at rest, and write it into the configuration.
+    """Measure zero, direction or tare of a sensor at rest, and write them into the configuration.
 
     The first call with --length-m gives the zero. A second call at another length, 5 mm or more
     away, gives the direction and checks the scale. Nothing is sent on the bus.
