@@ -148,7 +148,7 @@ class EffectSpec(_Frozen):
     """An effect of the catalogue with its parameters.
 
     Attributes:
-        name: Name of the effect in the catalogue.
+        name: Name of the effect, as on the page Effects.
         parameters: Values by name; all parameters of the effect are required.
     """
 
@@ -285,7 +285,7 @@ class ModelSpec(_Frozen):
         name: Name of the model.
         gravity_m_per_s2: Gravitational acceleration, in the direction of -z.
         skeleton: Bodies and joints: either `bodies` or `file`.
-        struts: Spring-dampers; one observer may act on each.
+        struts: Spring-dampers; each may have an observer.
         applied_force_body: Body at whose origin the applied force acts, in the direction of +z; by
             default the upper body of the last strut, or its lower body if the upper one is
             `world`.

@@ -32,7 +32,7 @@ def _pade_rates(
     if delay_s < _FOURTH_ORDER_FROM_S:
         rise = applied_force_n - (12.0 / delay_s * lag_1 + 6.0 * lag_2) / delay_s
         return lag_2, rise, 0.0, 0.0
-    # States are scaled by powers of the delay, so that all stay near the size of the force.
+    # States are scaled by powers of the delay, so that all are of the order of the force.
     highest = 1680.0 * lag_1 + 840.0 * lag_2 + 180.0 * lag_3 + 20.0 * lag_4
     rise = (applied_force_n - highest) / delay_s
     return lag_2 / delay_s, lag_3 / delay_s, lag_4 / delay_s, rise

@@ -8,7 +8,11 @@ from dart_model.effects.ranges import Starts, grid, moving, within
 
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter(
-    "final_fraction", "", 0.0, 3.0, "share of the damping that finally remains (above 1: it grows)"
+    "final_fraction",
+    "",
+    0.0,
+    3.0,
+    "share of the damping that remains in the end (above 1: it has grown)",
 )
 _LOSS = Parameter(
     "fraction_per_k",

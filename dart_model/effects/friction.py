@@ -67,7 +67,7 @@ def _presliding_rate(velocity_m_per_s: float, deflection: float, presliding_m: f
 
 def _elastoplastic_rate(velocity_m_per_s: float, deflection: float, presliding_m: float) -> float:
     # Elastic up to the limit, then sliding. The deflection approaches the limit gradually: if it
-    # stopped there within a step, the force could not be differentiated by the parameters.
+    # stopped there within a step, the force would have no derivative by the parameters.
     speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
     if velocity_m_per_s * deflection > 0.0:
         speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(deflection)), 0.0))
@@ -87,7 +87,7 @@ def _lugre(
     level = 1.0 + (static_to_coulomb - 1.0) * math.exp(-ratio * ratio)
     speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
     bending = (math.copysign(speed, velocity_m_per_s) - speed * deflection / level) * presliding_m
-    # The bristle's damping fades with speed, else it would act like a viscous damper.
+    # The bristle's damping falls with speed: otherwise it would act like a viscous damper.
     return (
         -coulomb_force_n * deflection
         - bristle_damping_n_s_per_m * math.exp(-ratio * ratio) * bending

@@ -49,7 +49,7 @@ def _dahl_rate(
 
 
 def _iwan(elements: Floats, yield_force_n: float) -> float:
-    # Each state is the share of the force that an element carries.
+    # Each state is the share of the yield force that an element carries.
     total = 0.0
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
@@ -61,7 +61,7 @@ def _iwan_rate(
     velocity_m_per_s: float, elements: Floats, yield_displacement_m: float, rates: Writable
 ) -> None:
     # Elements of equal stiffness slip one after another, each elastic up to its limit, which it
-    # approaches gradually: if it stopped there within a step, the force could not be differentiated
+    # approaches gradually: if it stopped there within a step, the force would have no derivative
     # by the parameters.
     speed = velocity_m_per_s / (yield_displacement_m * ELEMENTS)
     for i in range(ELEMENTS):
@@ -90,7 +90,7 @@ def _general_bouc_wen_rate(
     angle_rad: float,
 ) -> float:
     # beta = cos(angle) is not negative, so that a loop dissipates energy (Erlicher and Point). With
-    # gamma = sin(angle) below -beta, the slope grows without bound: ratio and rate are limited.
+    # gamma = sin(angle) below -beta, the slope would be unbounded: ratio and rate are limited.
     speed = velocity_m_per_s / bend_m
     limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
     ratio = min(abs(spring_deflection_m / bend_m), _LARGEST_RATIO) ** exponent

@@ -8,12 +8,12 @@ from dart_model.effects.law import Effect, Parameter
 
 
 def _none_beyond_dart() -> float:
-    # DART carries mass and weight.
+    # DART simulates the mass and its weight.
     return 0.0
 
 
 def _weight_compensation(gravity_m_per_s2: float, inertance_kg: float) -> float:
-    # DART carries the mass with its weight, which an inerter does not have.
+    # DART simulates the mass with its weight, which an inerter does not have.
     return inertance_kg * gravity_m_per_s2
 
 
@@ -41,7 +41,7 @@ INERTER = Effect(
             "kg",
             -1e9,
             1e9,
-            "inertia of the upper body without weight; an inerter if the lower end is fixed",
+            "added inertia of the upper body, without weight; an inerter if the lower end is fixed",
         ),
     ),
     force=_weight_compensation,

@@ -122,7 +122,7 @@ CUBIC_STIFFNESS = _spring(
 
 CENTRED_CUBIC_STIFFNESS = _spring(
     name="centred_cubic_stiffness",
-    words="a non-linear spring (cubic, about a centre of its own)",
+    words="a non-linear spring (cubic, about a centre height)",
     parameters=(
         Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
         Parameter("centre_height_m", "m", -1e4, 1e4, "height at which the force is zero"),

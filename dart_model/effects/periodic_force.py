@@ -28,7 +28,9 @@ PERIODIC_FORCE = Effect(
         Parameter("phase_rad", "rad", -100.0, 100.0, "phase of the sine at time zero"),
     ),
     force=_sine,
-    excitation="many periods of this force, and an applied force without its frequency",
+    excitation=(
+        "many periods of this force, and an applied force that does not contain its frequency"
+    ),
     reference="Rao, Mechanical Vibrations (2017), 3.7, rotating unbalance",
     starts=_starts,
     bounds=within(frequency_hz=lambda m: (_LEAST_PERIODS / m.duration_s, 0.5 / m.step_s)),

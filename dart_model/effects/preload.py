@@ -13,7 +13,7 @@ PRELOAD = Effect(
     words="a constant preload",
     parameters=(
         Parameter(
-            "force_n", "N", -1e12, 1e12, "constant force, positive when it pushes the bodies apart"
+            "force_n", "N", -1e12, 1e12, "constant force, positive when it pushes the ends apart"
         ),
     ),
     force=_constant,

@@ -16,8 +16,8 @@ from dart_model.effects.ranges import (
 )
 
 _CONTACT = Parameter("contact_height_m", "m", -1e4, 1e4, "height at which the stop is touched")
-_BUMP = "heights below the bump stop's contact, several times"
-_REBOUND = "heights above the rebound stop's contact, several times"
+_BUMP = "several contacts at the bump stop"
+_REBOUND = "several contacts at the rebound stop"
 _HUNT_CROSSLEY = "Hunt and Crossley, J. Appl. Mech. 42 (1975)"
 _KELVIN_VOIGT = "Goldsmith, Impact (1960), 4; Kelvin-Voigt contact"
 
@@ -317,7 +317,7 @@ END_STOPS = _stop(
     words="a bump stop and a rebound stop",
     parameters=(_LOW, _HIGH, *_LINEAR[1:]),
     force=_ends,
-    excitation="heights beyond both stops, several times",
+    excitation="several contacts at both stops",
     reference=_KELVIN_VOIGT,
     scaled=(2, 3),
     starts=_ends_starts,
@@ -331,7 +331,7 @@ HERTZ_END_STOPS = _stop(
     words="a bump stop and a rebound stop (Hertzian contact)",
     parameters=(_LOW, _HIGH, *_HERTZ[1:]),
     force=_hertz_ends,
-    excitation="heights beyond both stops, several times",
+    excitation="several contacts at both stops",
     reference=_HUNT_CROSSLEY,
     scaled=(2,),
     starts=_hertz_ends_starts,

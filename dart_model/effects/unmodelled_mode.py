@@ -15,8 +15,8 @@ def _hidden_mass(
     frequency_hz: float,
     damping_ratio: float,
 ) -> float:
-    # The deflection is counted from rest, where the spring carries the mass: its weight acts on
-    # the body.
+    # The deflection is that from the static equilibrium, where the spring carries the mass: the
+    # weight of the mass acts on the body.
     omega = 2.0 * math.pi * frequency_hz
     stretching = mass_velocity_m_per_s - velocity_m_per_s
     spring_and_damper = omega * (omega * deflection_m + 2.0 * damping_ratio * stretching)

@@ -109,34 +109,35 @@ class Supervision(BaseModel):
 
     Attributes:
         stale_after_s: Age of a height (on a dyno also of the load cell's force) from which the
-            estimate is invalid (HOLD). For the applied force it is three of its cycles, if that is
-            longer.
+            estimate is invalid (HOLD). For the applied force, the age is three cycles of its
+            message, if these are longer.
         safe_after_s: Age of a height, of the applied force or (on a dyno) of the load cell's force
             from which the bridge enters the safe state. If three cycles of the applied force are
             longer than `stale_after_s`, they extend this age, too, by the difference.
         settling_s: Time after a start, a gap, a change of gains or a saturated virtual force until
-            an estimate is valid. By default the time after which the error that a step of the
-            residual force causes in the closed loop has decayed to a hundredth of the step; for
-            `kalman` the filter's variance decides.
+            an estimate is valid. By default, with `pi`, the time after which the error that a step
+            of the residual force causes in the closed loop has decayed to a hundredth of the step;
+            with `kalman`, 1.27 / `bandwidth_hz` after the variance of the filter is steady. On a
+            dyno, nine times `prescribed_motion.settling_s`, whatever this key is.
         overload_share: The estimate is invalid (HOLD) while more than this share of the last few
             hundred ticks was missed.
-        arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
-            has to arm the bridge first, after each start and each safe state.
+        arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: in addition,
+            an operator has to arm the bridge after each start and each safe state.
         fade_in_s: Time in which the published force fades in, from the safe output to the
             estimate, before the estimate is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
             output. With `fade_in_s` alone, the safe output is published at once in HOLD and SAFE.
-            With neither key, the model's force is published in HOLD, and the safe output at once
-            in SAFE.
+            With neither of the two keys, the model's force is published in HOLD, and the safe
+            output at once in SAFE.
         watchdog: Whether a second process sends the safe output if the loop stands still for
             `safe_after_s` or its process dies; only on interfaces that several processes can share.
         log_fault: Reaction to a log that cannot be written: `continue`, or `safe` for the safe
             state.
         safe_output: Force that is published in the safe state: `zero`, or the `last` valid one.
-        limits: List of limits. A value without an entry has the range of its signal in the DBC as
-            its limit: a height, an applied force or a further sensor beyond it is refused, and a
-            published force beyond it leads to HOLD. A model height that leaves the range of the
-            measured height by a tenth of its span leads to SAFE.
+        limits: List of limits. For a value without an entry, the range of its signal in the DBC is
+            the limit: a height, an applied force or a further sensor beyond this range is refused,
+            and a published force beyond it leads to HOLD. A model height that leaves the range of
+            the measured height by a tenth of its span leads to SAFE.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

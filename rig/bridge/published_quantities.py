@@ -113,8 +113,8 @@ UNCERTAINTY = (
         Dimension.FORCE,
         lambda report, strut: _std_or_infinite(report.output.struts[strut].force_std_n),
         "FORCE_STD",
-        "standard deviation of the estimated force; the end of the signal's range if it is larger, "
-        "or if the observer does not compute it",
+        "standard deviation of the estimated force; the upper end of the signal's range if the "
+        "deviation is larger, or if the observer does not compute it",
         stops_at_range=True,
     ),
 )

@@ -79,16 +79,16 @@ class Limit(BaseModel):
             `force_difference_n` (estimated force less that of the load cell).
         low: Smallest permitted value; a limit has `low`, `high` or both.
         high: Largest permitted value.
-        for_s: Time for which a value of the estimate has to be beyond the limit until the action
+        for_s: Time for which a value of the estimate has to be beyond the limit before the action
             begins.
-        clear_s: Time for which a value of the estimate has to be within the limit until the action
+        clear_s: Time for which a value of the estimate has to be within the limit before the action
             ends (the safe state lasts until it is acknowledged); by default `for_s`, and at least
             1 s for `force_difference_n`, because a wrong force that oscillates crosses the right
             one.
-        action: `warn` reports the value in the status (`limit_fault`), as each of the others does.
-            `refuse` refuses the frame of a measurement. `hold` makes the estimate invalid while the
-            value is beyond the limit; `safe` enters the safe state. For a measurement, `hold` and
-            `safe` refuse its frame, too.
+        action: Every action reports the value in the status (`limit_fault`); `warn` does nothing
+            else. `refuse` also refuses the frame of a measurement. `hold` makes the estimate
+            invalid while the value is beyond the limit; `safe` enters the safe state. For a
+            measurement, `hold` and `safe` refuse its frame, too.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -79,10 +79,10 @@ class BusConfig:
     Attributes:
         interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
         channel: Channel of the interface.
-        bitrate: Bit rate in bit/s. With `socketcan` the key does not set it: state the rate that
-            was set with `ip link`, from which `rig check` computes the bus load.
-        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent. With `socketcan`
-            `ip link` sets it, too.
+        bitrate: Bit rate in bit/s. With `socketcan`, the key does not set the rate: state the rate
+            that was set with `ip link`, from which `rig check` computes the bus load.
+        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent. With `socketcan`,
+            `ip link` sets this rate, too.
         options: Further arguments of python-can's interface, by name.
     """
 

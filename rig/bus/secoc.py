@@ -68,9 +68,9 @@ class AuthenticationSettings(BaseModel):
         key_file: File with 32 hexadecimal digits, in the folder of the configuration.
         freshness_bits: Bits of the freshness value in a frame.
         mac_bits: Bits of the CMAC in a frame.
-        clock_tolerance_s: Largest difference between the clocks of bench and bridge at the start.
-            Even a bridge that has just been started refuses a frame that was recorded longer ago
-            than this.
+        clock_tolerance_s: Largest difference between the clocks of bench and bridge at the start. A
+            bridge that has just been started refuses an old frame that is sent again if its age is
+            larger than this.
         max_age_s: During the run, largest difference between the time of a frame and the bridge's
             clock, in either direction. It is larger than `clock_tolerance_s` because the clocks may
             drift apart; a smaller value counts as `clock_tolerance_s`.

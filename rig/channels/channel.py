@@ -67,19 +67,20 @@ class MeasuredSignal(SignalName):
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        valid: Signal of the same message that shows whether the sensor measures; a frame in which
-            this signal does not have `valid.value` is refused. If absent, every value is used.
+        valid: Signal of the same message that shows whether the measured value is valid; a frame in
+            which this signal does not have `valid.value` is refused. If absent, every value is
+            used.
         counter: Signal of the same message that rises by one with every frame, for a message
             without E2E protection. It shows frames that are lost, repeated or out of sequence. If
-            the DBC has the message's cycle time, the times of the samples follow from the counter.
-            If absent, lost frames are not counted.
+            the DBC contains the message's cycle time, the times of the samples follow from the
+            counter. If absent, lost frames are not counted.
         time: Signal of the same message with the sensor's time of the sample; it may restart at the
             end of its range. If absent, this time follows from the message's counter, or else from
             the arrival of the frame.
         zero: A reading at a known length of the strut; if absent, the reading is the length.
         reversed: True if the reading falls while the quantity grows; only for a force.
-        tare_n: Only for a force: the reading without a force, in N after the scaling by the DBC,
-            and before a reversal; 0 if absent.
+        tare_n: Only for a force: reading without a force, in N after the scaling by the DBC and
+            before a reversal; 0 if absent.
     """
 
     refused_keys: ClassVar[frozenset[str]] = frozenset({"zero"})

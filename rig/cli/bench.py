@@ -44,15 +44,15 @@ Bridge = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Configuration of a bridge: take bus, DBC and authentication from it instead.",
+        help="Configuration of a bridge, from which bus, DBC and authentication are taken.",
     ),
 ]
 Lockstep = Annotated[
     bool,
     typer.Option(
         "--lockstep",
-        help="Run that bridge too, both in simulated time, as fast as the machine allows and "
-        "without a bus.",
+        help="Also run the bridge of --bridge, both in simulated time, as fast as the machine "
+        "allows; requires --bridge and --out.",
     ),
 ]
 OtherModel = Annotated[
@@ -62,7 +62,7 @@ OtherModel = Annotated[
 Out = Annotated[
     Path | None,
     typer.Option(
-        metavar="DIR", help="Folder for summary.json; with --lockstep that of the bridge's run."
+        metavar="DIR", help="Folder for summary.json; with --lockstep, for the bridge's run."
     ),
 ]
 
@@ -80,9 +80,9 @@ def bench(
     out: Out = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a simulated bench on a bus in real time, or with its bridge in simulated time.
+    """Run a simulated bench on a bus in real time, or with a bridge in simulated time.
 
-    The second way, --lockstep, uses no bus.
+    --lockstep selects simulated time, which uses no bus.
     """
     from rig.bus.bus import BusConfig
     from rig.plan.load import load_plan

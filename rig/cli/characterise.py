@@ -38,7 +38,7 @@ Tolerance = Annotated[
 Master = Annotated[
     Path | None,
     typer.Option(
-        metavar="RUN", help="Record of a good damper in the same test, to name the fault of RUN."
+        metavar="RUN", help="Record of a good damper in the same test, with which RUN is compared."
     ),
 ]
 Scatter = Annotated[
@@ -47,7 +47,7 @@ Scatter = Annotated[
         metavar="SHARE",
         min=0.001,
         max=0.5,
-        help="Relative standard deviation of each property among good dampers.",
+        help="With --master: relative standard deviation of each property among good dampers.",
     ),
 ]
 
@@ -73,9 +73,9 @@ def characterise_command(
 ) -> None:
     """Report the figures of a damper: force over velocity, energy, gas force, friction, knee.
 
-    The cycles of a record must repeat; the report overlays several records. With --tolerance, the
-    exit code is 1 unless every point of the band passes; with --master, unless the damper
-    agrees with the master in all steps of the master's record.
+    A record must contain repeated cycles; several records are drawn into one report. With
+    --tolerance, the exit code is 1 unless every point of the band passes; with --master, unless the
+    damper agrees with the master in all steps of the master's record.
     """
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance

@@ -31,7 +31,10 @@ def check_command(
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
-    """Report what is wrong before a bench moves: signals, units, rate, bus load, poles."""
+    """Check a configuration before the bench moves: signals, units, rate, bus load, poles.
+
+    The exit code is 1 if there is an error; warnings do not change it.
+    """
     from rig.plan.load import load_plan
     from rig.plan.preflight_checks import Severity, check
 

@@ -28,7 +28,7 @@ def compare_command(
         list[float] | None,
         typer.Option(
             metavar="NUMBER",
-            help="Pressure, clicks or °C of a state; once for each state, in order.",
+            help="Pressure, clicks or °C of a state; once for each RUN, in the same order.",
         ),
     ] = None,
     strut: StrutOfRun = None,
@@ -36,7 +36,8 @@ def compare_command(
 ) -> None:
     """Compare two states of a damper: list the figures that differ significantly, and the others.
 
-    With --dose NUMBER for each state, fit a straight line to each figure over these numbers.
+    With --dose NUMBER for each of three or more states, fit a straight line to each figure over
+    these numbers.
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, trends_over_dose

@@ -24,30 +24,33 @@ def demo(
         str,
         typer.Option(
             metavar="CASE",
-            help=f"{STORY}: the whole method; or one of the cases reference, quarter_car, dyno.",
+            help=f"{STORY} (the whole method), reference, quarter_car or dyno.",
         ),
     ] = STORY,
     seed: Annotated[
         int,
         typer.Option(
-            metavar="N", min=0, help="Selects the undeclared effect of the story's bench."
+            metavar="N", min=0, help="Number that selects the effect of the story's bench."
         ),
     ] = 1,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder to write into; rig-demo by default.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="New folder; by default rig-demo, or if it exists rig-demo-2, ..."
+        ),
     ] = None,
     lockstep: Annotated[
         bool,
-        typer.Option("--lockstep", help="With a simulated clock, as fast as the machine allows."),
+        typer.Option("--lockstep", help="Use a simulated clock, as fast as the machine allows."),
     ] = False,
     duration_s: Annotated[
-        float | None, typer.Option(metavar="S", min=1.0, help="Duration of a run.")
+        float | None, typer.Option(metavar="S", min=1.0, help="Duration of each run.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
 
-    By default a bench with an undeclared effect is simulated; its run is logged and diagnosed, the
+    By default, the bench has an effect that the model lacks. A run is logged and diagnosed, the
     model is corrected, and the bench is run again.
     """
     from rig.demo.cases import CASES, DemoOptions, run_case

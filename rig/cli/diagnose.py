@@ -19,12 +19,13 @@ def diagnose(
         str,
         typer.Option(metavar="MODEL", help="Model file, or the name of a shipped model."),
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write into.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")],
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Run or CSV file that takes no part in the search and the fit; may be repeated.",
+            help="Run or CSV file that takes no part in the search and the fit; may be repeated. "
+            "Without it, blocks of RUN are held out.",
         ),
     ] = None,
     pdf: Annotated[
@@ -36,7 +37,7 @@ def diagnose(
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
-    """Identify the effects that the model lacks, correct it, and evaluate it on other data."""
+    """Identify the effects that a model lacks, correct the model, and evaluate it on other data."""
     from dart_model.spec import load_named_model
     from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json

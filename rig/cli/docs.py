@@ -19,7 +19,10 @@ def docs(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder of the site.")],
     as_json: JsonFlag = False,
 ) -> None:
-    """Build the guide as a web site that works without a network."""
+    """Build the guide as a web site that works without a network.
+
+    Requires the extra `guide`.
+    """
     from rig.guide.site import build_site
 
     index = build_site(folder, guide_blocks(context.parent))

@@ -35,8 +35,8 @@ def evaluate_command(
 ) -> None:
     """Evaluate models on runs: errors of their free-run simulation, with the noise floor.
 
-    No observer takes part, and nothing but the initial states is fitted. Where the motion is
-    prescribed, the force of the model along it is compared with the load cell.
+    No observer is used, and only the initial states are fitted. If the motion is prescribed, the
+    force of the model along the measured motion is compared with the load cell.
     """
     from dart_model.spec import load_named_model
     from rig.diagnosis.evaluate import evaluate_model

@@ -23,7 +23,9 @@ def export_command(
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="Folder of a run; with --fmu a model file.")
     ],
-    out: Annotated[Path, typer.Option(metavar="PATH", help="New file; for Parquet a folder.")],
+    out: Annotated[
+        Path, typer.Option(metavar="PATH", help="New file; with --format parquet, a new folder.")
+    ],
     kind: Annotated[
         str | None,
         typer.Option(
@@ -33,7 +35,7 @@ def export_command(
     smoothed: Annotated[
         bool,
         typer.Option(
-            "--smoothed", help="With --format csv: add the forces smoothed over the whole run."
+            "--smoothed", help="With --format csv: add forces that are smoothed over the whole run."
         ),
     ] = False,
     fmu: Annotated[

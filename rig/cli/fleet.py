@@ -107,14 +107,14 @@ def run_command(
         typer.Option(metavar="I/N", help="Compute only the I-th of N parts; I begins at 1."),
     ] = None,
     again: Annotated[
-        bool, typer.Option("--again", help="Also compute runs again that failed before.")
+        bool, typer.Option("--again", help="Also repeat runs that failed before.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> int:
     """Diagnose many runs, each by itself, and keep the results in a store of Parquet files.
 
-    What is in the store is not computed again: the same command continues a fleet that was
-    interrupted. A run that fails gets a row with its error; the exit code is then 1.
+    Runs whose results are in the store are not computed again, so that the same command continues
+    after an interruption. A run that fails gets a row with its error; the exit code is then 1.
     `rig fleet SOURCE...` is short for `rig fleet run SOURCE...`.
     """
     from dart_model.spec import model_file
@@ -226,7 +226,7 @@ def report_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Summarise a store: verdicts, changes, wear, outliers, common steps of a bench's dampers."""
+    """Summarise a store: verdicts, changes, wear, outliers, steps common to a bench's dampers."""
     from rig.fleet.overview import read_overview
 
     refuse_existing(out)

@@ -36,8 +36,8 @@ FmuFlag = Annotated[
     bool,
     typer.Option(
         "--fmu",
-        help="Make a model from SOURCE, an FMU. --mapping names the variables by their roles, "
-        "unless they have the names of an FMU of `rig export`.",
+        help="Make a model from SOURCE, an FMU. --mapping assigns the variables to their roles; it "
+        "is not required for an FMU of `rig export`.",
     ),
 ]
 
@@ -70,19 +70,19 @@ def import_command(
         float | None,
         typer.Option(
             metavar="KG",
-            help="With --fmu: mass that the strut carries; of the FMU of a bench, its mass instead "
-            "of the computed one.",
+            help="With --fmu: mass that the strut carries; for the FMU of a whole bench, the "
+            "moving mass, which is otherwise computed from the FMU.",
         ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Import a table as CSV, a bus log or an export as a run, or an FMU as a model.
 
-    A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, an MTS file at least --rebound. A bus
-    log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export` wrote as MF4 or
-    Parquet requires neither; one that it wrote as CSV need not be imported. With --fmu, SOURCE is a
-    functional mock-up unit (FMU). An FMU is a program; the command permits it to run on this
-    machine.
+    A table (text, XLSX, TDMS, MF4) requires --mapping, an MTS table either --mapping or
+    --rebound. A bus log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export`
+    wrote as MF4 or Parquet requires neither; a run that it wrote as CSV need not be imported. With
+    --fmu, SOURCE is a functional mock-up unit (FMU). An FMU contains a program: to import it
+    permits this program to run on this machine.
     """
     if fmu:
         if config is not None or rebound is not None:

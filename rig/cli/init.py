@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "Examples: `rig init --dbc my.dbc --out my.yaml`, which asks for the rest · `rig init --dbc "
     "my.dbc --out my.yaml --mass-kg 24 --length-at-rest-m 0.36 --stiffness-n-per-m 9000` · with "
-    "stiffness and damping from ten seconds of motion on the bus: `--listen-s 10` · from a "
-    "recording: `--run sweep.csv`"
+    "`--listen-s 10`, stiffness and damping from ten seconds of motion; with `--run sweep.csv`, "
+    "from a recording"
 )
 
 _NONE = "none"
@@ -108,7 +108,10 @@ def init(
     applied_force: AppliedForce = None,
     load_cell: LoadCell = None,
     is_dyno: Annotated[
-        bool, typer.Option("--dyno", help="The bench prescribes the strut's motion.")
+        bool,
+        typer.Option(
+            "--dyno", help="The bench prescribes the strut's motion; requires a load cell."
+        ),
     ] = False,
     mass_kg: Mass = None,
     length_at_rest_m: LengthAtRest = None,
@@ -124,7 +127,8 @@ def init(
     """Propose a configuration and a first model for a bench whose bus a DBC describes.
 
     Signals are ranked by unit, name, comment, range, step and cycle; the configuration states why
-    each was chosen and what else it may be. What the options leave open is asked for in a terminal.
+    each was chosen, and which others are possible. In a terminal, the command asks for required
+    values that no option states.
     """
     from can_dbc.database import load_database
     from rig.bus.bus import BusConfig

@@ -14,7 +14,7 @@ def replay_command(
     out: SummaryFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Compute a run again from its frames and compare it with its log, bit for bit."""
+    """Compute a run again from its frames and compare the result with its log, bit for bit."""
     from rig.log.checksums import refuse_damage
     from rig.log.reader import find_changed_files
     from rig.run.replay import replay

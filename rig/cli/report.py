@@ -15,10 +15,13 @@ def report(
     run: RunFolder,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File to write; RUN/report.html by default."),
+        typer.Option(metavar="FILE", help="New HTML file; RUN/report.html by default."),
     ] = None,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Also write it as PDF; requires Chromium, Chrome or Edge.")
+        bool,
+        typer.Option(
+            "--pdf", help="Also write the report as PDF; requires Chromium, Chrome or Edge."
+        ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

@@ -53,15 +53,16 @@ def run(
     trace: Annotated[
         bool,
         typer.Option(
-            "--trace", help="Record how long each part of a late tick takes, for `rig timing`."
+            "--trace", help="Record the duration of each part of late ticks, for `rig timing`."
         ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it properly.
 
-    Each of several configurations runs as a separate process, with a folder in `--out` that has the
-    name of the configuration. The exit code is the worst of theirs: 2, then 1.
+    Several configurations run as separate processes, each with a folder in `--out` that has the
+    name of the configuration. The exit code is 2 if one of them ends with 2, otherwise 1 if one
+    ends with 1.
     """
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     if len(configs) > 1:

@@ -54,8 +54,8 @@ EdsFiles = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NODE=FILE",
-        help="EDS file of the sensor with this node id, which need not be connected: no bus is "
-        "opened. May be repeated.",
+        help="EDS file of the sensor with this node id. The sensor need not be connected: no bus "
+        "is opened. May be repeated.",
     ),
 ]
 CycleMs = Annotated[
@@ -90,7 +90,7 @@ def scan_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Find the CANopen and J1939 sensors on a bus, and write a DBC and a configuration.
+    """Find the CANopen and J1939 sensors on a bus; with --out, write a DBC and a configuration.
 
     The device type is requested from every CANopen node id, the PDO mapping from each device, and
     address claims from J1939 devices; nothing is changed. On a bus with other devices, for which
@@ -139,7 +139,8 @@ def set_command(
     ] = False,
     heartbeat_ms: HeartbeatMs = None,
     new: Annotated[
-        bool, typer.Option("--new", help="First give NODE to the device that has no node id (LSS).")
+        bool,
+        typer.Option("--new", help="First assign NODE to the device that has no node id (LSS)."),
     ] = False,
     before: Before = None,
     restore_from: Annotated[
@@ -147,7 +148,7 @@ def set_command(
         typer.Option(
             "--restore",
             metavar="FILE",
-            help="Write the values in this file, which --before named, back to the device.",
+            help="Write the previous values in this file (see --before) back to the device.",
         ),
     ] = None,
     interface: Interface = "socketcan",
@@ -155,10 +156,10 @@ def set_command(
     bitrate: Bitrate = 500_000,
     as_json: JsonFlag = False,
 ) -> None:
-    """Set a CANopen sensor's cycle and heartbeat and start it; or undo these changes.
+    """Set cycle and heartbeat of a CANopen sensor and start the sensor, or undo these changes.
 
-    The changes are lost when the device is switched off: nothing is stored in it. After --restore
-    the device is pre-operational, its state after switching on.
+    The changes are lost when the device is switched off: nothing is stored in it. After --restore,
+    the device is pre-operational, as after switching on.
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork

@@ -35,7 +35,7 @@ def set_command(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Change gains or limits of a run in progress, acknowledge its safe state, or arm it."""
+    """Change gains or limits of a run in progress, acknowledge a safe state, or arm the bridge."""
     from rig.run.change_requests import ask
     from rig.run.changed_settings import parse_assignments
     from rig.run.operator import user_name

@@ -9,7 +9,7 @@ import typer
 from can_dbc.errors import InputError
 
 SummaryFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder for summary.json.")
 ]
 
 

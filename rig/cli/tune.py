@@ -35,8 +35,8 @@ Run = Annotated[
     Path | None,
     typer.Option(
         metavar="RUN",
-        help="A run of the bench, some seconds of its usual motion: noise, residual force and "
-        "latency are taken from it.",
+        help="Run with some seconds of the bench's usual motion, from which noise, residual force "
+        "and latency are estimated.",
     ),
 ]
 ResidualRms = Annotated[
@@ -56,7 +56,7 @@ NoiseStd = Annotated[
         min=1e-12,
         max=1.0,
         help="Without a run: standard deviation of the height's noise; by default that of its "
-        "quantisation, by the signal's resolution in the DBC.",
+        "quantisation, from the signal's resolution in the DBC.",
     ),
 ]
 GainMargin = Annotated[
@@ -104,7 +104,7 @@ def tune_command(
             metavar="RATIO",
             min=0.0,
             max=1.0,
-            help="Damping ratio that every pole of the loop must have at least.",
+            help="Least permitted damping ratio of the poles of the loop.",
         ),
     ] = 0.1,
     gain_margin: GainMargin = None,
@@ -117,11 +117,14 @@ def tune_command(
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw the expected error over bandwidth, PNG."),
+        typer.Option(metavar="FILE", help="New PNG file with the expected error over bandwidth."),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Tune the observers: the gains with the smallest expected error of the force."""
+    """Choose the observer gains with the smallest expected error of the force.
+
+    Requires --run, or --residual-n and --up-to-hz.
+    """
     from rig.pages.tuning_picture import draw_tuning
     from rig.plan.load import load_plan
     from rig.tuning.gains import KINDS, Aim

@@ -35,7 +35,7 @@ ControlFlag = Annotated[
     typer.Option(
         "--control",
         help="Let the page change gains and limits of a run in progress, acknowledge and arm, and "
-        "start a diagnosis of a finished run; open the address that is printed.",
+        "start a diagnosis of a finished run. No browser is opened: open the printed address.",
     ),
 ]
 FoxgloveFlag = Annotated[

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rig.sensors.mounting import Mounting, Readings
 
 EXAMPLES = (
-    "Examples: `rig zero rig.yaml --length-m 0.360`, then at another length once more, for the "
+    "Examples: `rig zero rig.yaml --length-m 0.360`, and again at another length, for the "
     "direction · `rig zero rig.yaml --strut tyre --length-m 0.215` · "
     "`rig zero rig.yaml --tare load_cell_force`"
 )
@@ -70,16 +70,16 @@ def zero_command(
         bool,
         typer.Option(
             "--remounted",
-            help="The sensor was moved since its last zero: do not determine direction and scale "
-            "from that zero.",
+            help="The sensor has been moved since its last zero: do not determine direction and "
+            "scale from that zero.",
         ),
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Measure a sensor's zero, direction or tare at rest, and write it into the configuration.
+    """Measure zero, direction or tare of a sensor at rest, and write them into the configuration.
 
-    A first length gives the zero. A second one, 5 mm or more away, shows whether the sensor is
-    reversed, and whether its scale is right. Nothing is sent.
+    The first call with --length-m gives the zero. A second call at another length, 5 mm or more
+    away, gives the direction and checks the scale. Nothing is sent on the bus.
     """
     from rig.plan.load import load_plan
     from rig.sensors.mounting import as_read, entry_of, find_tare, find_zero, write_mounting

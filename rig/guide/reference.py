@@ -184,15 +184,15 @@ def _effect(item: Effect, pictures: Path | None) -> str:
     ]
     more = len(item.parameters) - _MOST_PARAMETERS
     names = ", ".join(f"`{name}`" for name in item.simpler)
-    simpler = f" A diagnosis names a simpler law instead if that law fits as well: {names}."
+    simpler = f" If a simpler law ({names}) fits as well, a diagnosis names that law instead."
     simpler *= bool(item.simpler)
-    beyond = " in addition to the inertia of the body" if item.adds_mass else ""
+    beyond = " in addition to the inertia and the weight of the mass" if item.adds_mass else ""
     parts = [
         f"### {item.name}",
         f"{item.words[0].upper()}{item.words[1:]}.{simpler} Required excitation: "
         f"{item.excitation}.",
         _table(("Parameter", "Unit", "Bounds", "Meaning"), rows),
-        *([f"Further parameters: {more}, of the same kind."] if more > 0 else []),
+        *([f"The {more} other parameters are of the same kind."] if more > 0 else []),
         f"Force{beyond}, N:\n\n```python\n{_formula('force_n', item.force)}\n```",
     ]
     if item.rate:

@@ -115,8 +115,8 @@ class SensorSignal(HeightSignal):
     Attributes:
         reversed: True if the reading falls while the quantity grows; requires `zero` with
             `measures: height`.
-        tare_n: Reading without a force, in N after the scaling by the DBC, and before a reversal;
-            0 if absent.
+        tare_n: Reading without a force, in N after the scaling by the DBC and before a reversal; 0
+            if absent.
         delay_s: Time from the instant that the value describes to the arrival of its frame.
         measures: What it measures.
     """
@@ -279,11 +279,11 @@ class LogConfig(_Frozen):
         rotate_s: Time after which the log continues in a further file; no limit if absent.
         capture_before_s: Length of an excerpt before the fault.
         capture_after_s: Length of an excerpt after the fault.
-        most_captures: Largest number of excerpts around faults in one run. An excerpt is kept at
-            HOLD, SAFE, a value beyond a limit (also with the action `warn`), a fault of the bus or
-            the log, and SIGUSR2.
+        most_captures: Largest number of excerpts around faults in one run; 0 keeps none. An excerpt
+            is kept at HOLD, SAFE, a value beyond a limit (also with the action `warn`), a fault of
+            the bus or the log, and SIGUSR2.
         sync_s: Interval at which the log is flushed to the disk (`fsync`), in real time only. With
-            null the operating system decides, after up to half a minute.
+            null, the operating system decides when it flushes; this may take half a minute.
     """
 
     rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
@@ -322,7 +322,7 @@ class RunConfig(_Frozen):
         prescribed_motion: Declares a dyno: the motion is prescribed, a load cell is required, and
             an applied force and further sensors are not permitted.
         observers: Observer of each strut, by strut name; `pi` for a strut without an entry. A dyno
-            uses no observer. The tables below list the keys of each kind.
+            uses no observer. The section Observers of this page lists the keys of each kind.
         publish: Signals that carry the quantities of each strut, by strut name and by the keys of
             the published quantities. By default RIG_ESTIMATE and RIG_KINEMATICS, if the DBC has
             them, for the first strut, and these names with _2, _3, ... for the next ones.

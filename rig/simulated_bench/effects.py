@@ -124,7 +124,7 @@ _PARAMETERS: dict[LawCode, tuple[EffectParameter, ...]] = {
 }
 _WORDS: dict[LawCode, str] = {
     LawCode.PRELOAD: "constant force",
-    LawCode.LINEAR_STIFFNESS: "linear spring without force at the free length",
+    LawCode.LINEAR_STIFFNESS: "linear spring whose force is zero at the free length",
     LawCode.QUADRATIC_STIFFNESS: "force -`stiffness_n_per_m2` * deflection², with the same sign "
     "on both sides of the free length",
     LawCode.CUBIC_STIFFNESS: "restoring force proportional to the cube of the deflection",
@@ -155,7 +155,7 @@ _WORDS: dict[LawCode, str] = {
     LawCode.ADDED_MASS: "additional mass on the upper body",
     LawCode.INPUT_GAIN: "ratio of the force that acts on the body to the measured applied force (1 "
     "changes nothing)",
-    LawCode.DELAY: "delay of the force that acts on the body behind the measured applied force",
+    LawCode.DELAY: "time by which the force that acts on the body lags the measured applied force",
 }
 _STATES = {LawCode.FRICTION: 1, LawCode.BOUC_WEN: 1, LawCode.MAXWELL: 1, LawCode.HIDDEN_MASS: 2}
 

@@ -95,7 +95,7 @@ class BenchStrut(_Section):
         name: Name of the strut.
         between: Lower and upper body. The lower one is `world` or the upper body of a strut earlier
             in the list. Every body is the upper body of exactly one strut.
-        free_length_m: Height at which the deflection in the laws of undeclared effects is zero, in
+        free_length_m: Height at which the deflection is zero in the laws of undeclared effects, in
             m.
         spring: Spring curve, given by points: monotone cubic interpolation between them, linear
             extrapolation beyond them.
@@ -353,7 +353,7 @@ class UndeclaredEffect(_Section):
     """An effect of the bench that no model declares.
 
     Attributes:
-        name: Name of the effect, from the table of effects.
+        name: Name of the effect, as in the table of effects.
         strut: Strut in which the effect acts, or whose upper body it changes.
         parameters: Values of the effect's parameters, by name; those with a default may be absent.
     """
@@ -453,11 +453,11 @@ class Transmission(_Section):
         latency_ns: Time from sample to transmission in ns.
         jitter_ns: Largest additional delay in ns; the delay is uniformly distributed from zero to
             this value.
-        loss_probability: Probability that a frame is lost; the message's counter then shows it.
-        height: Height sensor, if the message carries one.
-        applied_force: Sensor of the applied force, if the message carries one.
-        strut_force: Load cell, if the message carries one.
-        temperature: Thermometer, if the message carries one.
+        loss_probability: Probability that a frame is lost; the message's counter shows the loss.
+        height: Height sensor whose reading is in the message, if any.
+        applied_force: Sensor of the applied force whose reading is in the message, if any.
+        strut_force: Load cell whose reading is in the message, if any.
+        temperature: Thermometer whose reading is in the message, if any.
         counter: Signal that counts the frames, for a message without E2E protection.
         time: Signal with the sample time by the clock of the bench; it wraps around at the end of
             its range.
@@ -494,8 +494,8 @@ class BenchConfig(_Section):
         struts: Struts. Each carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any.
         prescribed_motion: The motion that drives a strut, if any (a dyno).
-        temperature: Temperature of the dampers (one for all): the power that they dissipate by
-            their curves heats them, and the air cools them.
+        temperature: Temperature, common to all dampers: the power that their damper curves
+            dissipate heats them, and the air cools them.
         undeclared_effects: Effects of the bench that the bridge's model does not contain.
         transmissions: Messages that the bench sends.
         seed: Seed of the random numbers for noise, jitter and loss.
