@@ -43,7 +43,8 @@ the ratio of the two medians.
   a frame, without checks, modes or limits.
 
 Ratios to DART alone vary from machine to machine; those to the hand-written loop, which like the
-bridge is mostly Python, vary less. For times of a live run see [In real time](real-time.md).
+bridge is mostly Python, vary less. For times of a live run see
+[lateness and force error in real time](real-time.md).
 """
 SCALAR, ARRAY = "DART, scalar functions", "DART, array functions"
 BY_HAND = "hand-written loop"
