@@ -18,9 +18,10 @@ FAULTS_TEXT = """
 The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
 fault. Faults of frames, bench and devices are injected in simulated time, 2 s after the start;
 faults of disk and process in real runs. *Within* is the time from the fault to the first tick that
-shows it, or to the state that is named; *loss* states which data are lost. The force error is the
-RMS difference to the simulated bench over the valid ticks; it is compared with that of the same run
-without the fault. Combinations of faults are not in this table.
+shows it (for a stuck value and a bench that stops sending, to the safe state); *loss* states which
+data are lost. The force error is the RMS difference to the simulated bench over the valid ticks; it
+is compared with that of the same run without the fault. Combinations of faults are not in this
+table.
 """
 
 PROMISE_TEXT = """
