@@ -52,7 +52,7 @@ The lateness is the time from a tick's deadline to the wake-up of the loop; the 
 time) is the time from the wake-up to the end of the tick. A missed tick is counted and not made up
 for. The force error is the RMS difference between the estimated force and that of the simulated
 bench's load cell, relative to the peak force. The lateness depends on the machine as much as on the
-program: it differs on another machine. No CAN hardware took part.
+program, and differs on another machine. No CAN hardware took part.
 """
 
 _ROUND_NS = 20_000_000
@@ -157,7 +157,7 @@ def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error:
     levels = [f"{level.replace('_', '.')}, µs" for level in times["lateness"]]
     write_evidence(
         "real-time",
-        "In real time",
+        "Lateness and force error in real time",
         TEXT.format(
             rate_hz=rate_hz,
             seconds=seconds,

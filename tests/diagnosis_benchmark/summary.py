@@ -38,17 +38,19 @@ is named there is counted apart."""
 TEXT = f"""
 Recordings are simulated on benches with known truth, by a generator with its own equations of
 motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno; the
-nominal model is exact (apart from these effects) or rough.
+nominal model is exact (apart from these effects) or rough: its stiffness is wrong by up to 20 %,
+its damping by up to 40 %, mass and preload by up to 5 %, and the applied force by up to 2 %.
 
-The names of the groups: `single`, `pair` and `triple` have one, two and three planted effects,
-`complete` none. `foreign` has formulas that are not in the catalogue, `outside` forces that no law
-describes. `rough` (alone: with one effect) has a rough nominal model. `dyno` (alone: with one
-effect) is on a dyno; there, about half of the cases have a rough nominal model, unless the planted
-effect is linear. With a rough nominal model and no planted effect, `explained` is right, because
-linear corrections explain the data. The rows in italics combine several groups.
+`single`, `pair` and `triple` are groups with one, two and three planted effects; `complete` has
+none. In `foreign`, the planted force has a formula that `rig` does not contain; in `outside`, none
+of its laws describes the planted force. `rough` stands for a rough nominal model, `dyno` for a
+dyno; `rough` and `dyno` alone have one planted effect. On dynos, about half of the cases have a
+rough nominal model, unless the planted effect is linear. With a rough nominal model and no planted
+effect, `explained` is right, because linear corrections explain the data. The rows in italics
+combine several groups.
 
-{{groups}} The command at the end of the page contains the share of each group that was run
-(`--one-of`).
+{{groups}} With `--one-of N` in the command at the end of the page, one
+case of N was run in each group.
 
 A case counts as right if
 
@@ -66,11 +68,11 @@ A case counts as right if
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
 *False names* is the share of cases in which a family is named that was not planted, with at least
-one parameter that the data bound; *not bound* is the share of cases in which the data do not
-exclude that a named effect has the size zero. Shares are given with their 95 % interval after
-Wilson. The intervals of parameters are counted only in cases that are right. A case has several of
-them; the Wilson interval of their share assumes that they are independent, and is too narrow. The
-durations depend on the load of the machine, which is stated at the end of the page.
+one identifiable parameter; *not bound* is the share of cases in which the data do not exclude that
+a named effect has the size zero. Each share is given with its 95 % Wilson interval. The intervals
+of parameters are counted only in cases that are right. A case has several of them; the Wilson
+interval of their share assumes that they are independent, and is too narrow. The durations depend
+on the load of the machine, which is stated at the end of the page.
 """
 
 

@@ -10,9 +10,9 @@ from tests.dyno.dynos import drawn, found
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 TEXT = """
-{cases} records of sine tests are simulated. At random are the frequency (0.3 to 4 Hz), the
-amplitude (8 to 30 mm), the number of cycles (5 to 15), the samples per cycle (16 to 400) and the
-phase, and the white noise: of the force 0.2, 1 or 3 % of the damping force at mid-stroke, of the
+{cases} records of sine tests are simulated. Frequency (0.3 to 4 Hz), amplitude (8 to 30 mm), number
+of cycles (5 to 15), samples per cycle (16 to 400) and phase are drawn at random, and so is the
+white noise: that of the force is 0.2, 1 or 3 % of the damping force at mid-stroke, that of the
 height 0.01 or 0.1 % of the amplitude. Each record has one of four laws with fixed parameters:
 
 - digressive: a digressive damper, stronger in rebound, and a linear gas force,
@@ -22,8 +22,8 @@ height 0.01 or 0.1 % of the amplitude. Each record has one of four laws with fix
 
 `rig characterise` computes the figures of each record with 95 % intervals; the true values are
 known. The table gives the share of the intervals that contain the true value, over all laws and for
-each law. In parentheses: the median half width of the interval in percent of the true value; absent
-if the true value is zero. Correlated noise and the errors of a real sensor are not part of this
+each law. The median half width of the intervals is in parentheses, in percent of the true value,
+unless the true value is zero. Correlated noise and the errors of a real sensor are not part of this
 study.
 
 *Window* is the mean force in a window about mid-stroke, *peak* the largest force, *energy* that of

@@ -18,16 +18,18 @@ FAULTS_TEXT = """
 The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
 fault. Faults of frames, bench and devices are injected in simulated time, 2 s after the start;
 faults of disk and process in real runs. *Within* is the time from the fault to the first tick that
-shows it, or to the state that is named; *loss* is what is lost of the data. The force error is the
-RMS difference to the simulated bench over the valid ticks; it is compared with that of the same run
-without the fault. Combinations of faults are not in this table.
+shows it (for a stuck value and a bench that stops sending, to the safe state); *loss* states which
+data are lost. The force error is the RMS difference to the simulated bench over the valid ticks; it
+is compared with that of the same run without the fault. Combinations of faults are not in this
+table.
 """
 
 PROMISE_TEXT = """
-A node on the bus decodes the bridge's frames with cantools; neither the log nor internal values of
-the bridge are used. The bench is the reference case in simulated time, and most events begin 2 s
-after the start. The test fails if a force with `VALID` = 1 has an error of more than three times
-the largest error of the settled run.
+For each event, the table shows when `VALID` becomes 0 and when it is 1 again, and the largest error
+of a force with `VALID` = 1. A node on the bus decodes the bridge's frames with cantools; neither
+the log nor internal values of the bridge are used. The bench is the reference case in simulated
+time, and most events begin 2 s after the start. The test fails if a force with `VALID` = 1 has an
+error of more than three times the largest error of the settled run.
 
 - *First invalid frame* and *valid again* are times since the event; these and the modes are those
   of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent every 100 ms: a
@@ -35,8 +37,7 @@ the largest error of the settled run.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
   published gains / a damped PI observer / the noise-aware observer.
 - In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the
-  operating system, with a virtual bus in a separate network namespace;
-  only `VALID` is decoded.
+  operating system, with a virtual bus in a separate network namespace; only `VALID` is decoded.
 - The last column states what the bench itself has to do.
 """
 

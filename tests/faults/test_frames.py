@@ -131,7 +131,8 @@ def test_delay(row, undisturbed_n):
         "delay: from one instant on, all frames arrive 3 ms later, stamped on arrival",
         f"refuses {refused} frames that contradict their sender's clock, and the estimate settles "
         "again; then the delay is attributed to the sender: force error "
-        f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (state it with `delay_s`)",
+        f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (state a known delay with "
+        "`delay_s`)",
         first_ms(ticks, lambda tick: not tick.is_valid),
         "the refused frames",
     )

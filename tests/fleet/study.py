@@ -37,11 +37,11 @@ processes. The throughput is compared with that of plain loops, which diagnose o
 other: {CORES} such loops run simultaneously, one per core; together they diagnose {singles} runs,
 each run once.
 
-As the cost of distribution, the CPU time of the campaign's process, which distributes the runs and
-writes the store, and that of Dask's scheduler are counted. The overhead inside the workers is not
-counted. The runs are short: with longer ones, distribution costs a smaller share. The cost per run
-contains a share of the fixed cost of the campaign, which is larger with few runs. The cost for a
-million runs is a million times this cost per run, and therefore rather too high.
+The cost of distribution is the CPU time of the campaign's process, which distributes the runs and
+writes the store, plus that of Dask's scheduler. The overhead inside the workers is not counted. The
+runs are short: with longer runs, distribution costs a smaller share. The cost per run contains a
+share of the fixed cost of the campaign, which is larger with few runs. The cost for a million runs
+is a million times this cost per run, and is therefore an upper estimate.
 
 The loops and the two campaigns ran one after the other, each under a different load of the machine.
 The throughput depends on this load: a ratio above 1 is its effect. The ratios therefore neither

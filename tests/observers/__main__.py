@@ -332,7 +332,7 @@ def grid_part(rows):
     words = (
         f"{len(rows)} benches of the grid: {_span(MASSES_KG, 1)} kg, {_span(NATURAL_HZ, 1)} Hz, "
         f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights per second. The errors "
-        "are divided by the errors with the published gains, which are scaled with the mass. A "
+        "are divided by the errors with the published gains (scaled with the mass). A "
         "ratio near zero means that the error with the published gains is far larger than the "
         "force itself, as in an unstable loop:"
     )

@@ -40,11 +40,11 @@ The observers follow measured records, and the estimated force is compared with 
   constructed: the applied force is the force that this body requires for the smoothed motion. The
   observer uses this force and the unsmoothed displacement; the reference is the load cell.
 
-An error is the RMS error relative to the standard deviation of the force. A first pass with an
-untuned noise-aware observer determines the longest section without an interruption; the error is
-evaluated at the valid ticks of this section, without its first 0.5 s. The share of valid ticks is
-in parentheses if it is below 100 %. `lost` stands for an error of more than twice the standard
-deviation. The gains are tuned on the same record.
+An error is the RMS error relative to the standard deviation of the reference force. A first pass
+with an untuned noise-aware observer determines the longest section without an interruption; the
+error is evaluated at the valid ticks of this section, without its first 0.5 s. The share of valid
+ticks is in parentheses if it is below 100 %. `lost` stands for an error of more than twice the
+standard deviation. The observers are tuned on the record on which they are evaluated.
 """
 
 MODEL = """

@@ -13,14 +13,15 @@ from tests.scoreboard.run import run_scoreboard
 from tests.scoreboard.table import page
 
 TEXT = """
-Published data of measured benches are diagnosed with `rig diagnose`, from a start model; the last
-column states where its parameters are from. Laws and parameters are searched for and fitted on the
-training data. The test data decide two things afterwards. If all data are described as well without
-the laws, these are removed. With the verdict `not_explained`, the model with the least error on the
-test data is taken, so that this error is slightly optimistic.
+Published data of measured benches are diagnosed with `rig diagnose`. Its nominal model is the start
+model; the last column states where the parameters of this model are from. Laws and parameters are
+searched for and fitted on the training data. The test data decide two things afterwards: if all
+data are described as well without the laws, these are removed; and with the verdict
+`not_explained`, the model with the smallest error on the test data is used, so that this error is
+slightly optimistic.
 
-A table contains one data set, with one row per model and one column per test. The models called
-`rig` were computed here; the others are published figures from the source in the last column.
+Each table contains one data set, with one row per model and one column per test. The errors of the
+models called `rig` were computed here; the others were published in the source in the last column.
 
 EMPS is an electro-mechanical positioning stage without a spring (Janot, Gautier, Brunot 2019). Its
 recordings `train` and `pulses` are each used once for training and once for the test.
