@@ -69,6 +69,16 @@ LengthAtRest = Annotated[
     float | None,
     typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest, in m."),
 ]
+FreeLength = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M",
+        min=1e-3,
+        max=100.0,
+        help="Length of the strut without a force, as a drawing states it; by default from the "
+        "length at rest, mass and stiffness.",
+    ),
+]
 Stiffness = Annotated[
     float | None,
     typer.Option(
@@ -115,6 +125,7 @@ def init(
     ] = False,
     mass_kg: Mass = None,
     length_at_rest_m: LengthAtRest = None,
+    free_length_m: FreeLength = None,
     stiffness_n_per_m: Stiffness = None,
     damping_n_s_per_m: Damping = None,
     run: Run = None,
@@ -152,6 +163,7 @@ def init(
             stiffness_n_per_m, "--stiffness-n-per-m", "Stiffness, roughly, N/m", None
         )
     model, source = _first_model(mass_kg, length_at_rest_m, stiffness_n_per_m, damping_n_s_per_m)
+    model = replace(model, stated_free_length_m=free_length_m)
     if run is not None or listen_s is not None:
         fit = _measure(proposal, model, run, listen_s)
         model = replace(
@@ -249,7 +261,7 @@ def _first_model(
     if damping_n_s_per_m is None:
         damping, source = rough_damping_n_s_per_m(mass_kg, stiffness), "its damping a guess"
     else:
-        damping, source = damping_n_s_per_m, "from a catalogue"
+        damping, source = damping_n_s_per_m, "both as stated"
     return FirstModel(mass_kg, rest_m, stiffness, damping), source
 
 

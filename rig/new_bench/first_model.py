@@ -69,17 +69,28 @@ class FirstModel:
     Attributes:
         mass_kg: Mass that moves with the strut's upper end.
         rest_m: Length of the strut at rest.
+        stated_free_length_m: Length of the strut without a force, by a drawing; None if it follows
+            from the length at rest.
     """
 
     mass_kg: float
     rest_m: float
     stiffness_n_per_m: float
     damping_n_s_per_m: float
+    stated_free_length_m: float | None = None
 
     @property
     def free_length_m(self) -> float:
         """Length of the strut without a force: the weight shortens it."""
+        if self.stated_free_length_m is not None:
+            return self.stated_free_length_m
         return self.rest_m + self.mass_kg * GRAVITY_M_PER_S2 / self.stiffness_n_per_m
+
+    @property
+    def _source_of_length(self) -> str:
+        if self.stated_free_length_m is not None:
+            return "as stated"
+        return f"{self.rest_m:g} m at rest, under the weight"
 
     def text(self, name: str, source: str) -> str:
         """YAML of the model.
@@ -99,8 +110,7 @@ class FirstModel:
             "struts:\n"
             "  - name: strut\n"
             "    between: [world, body]\n"
-            f"    free_length_m: {self.free_length_m:.6g}   # {self.rest_m:g} m at rest, "
-            "under the weight\n"
+            f"    free_length_m: {self.free_length_m:.6g}   # {self._source_of_length}\n"
             f"    stiffness_n_per_m: {self.stiffness_n_per_m:.6g}\n"
             f"    damping_n_s_per_m: {self.damping_n_s_per_m:.6g}\n"
             "    effects: []\n"

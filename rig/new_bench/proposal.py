@@ -51,6 +51,9 @@ _STATE_WORDS = ("state", "mode", "status", "zustand")
 _LEAST_STATE_BITS = 3
 """A mode is a number from 0 to 6."""
 
+_FIRST_OWN_ID, _LAST_OWN_ID = 0x680, 0x700
+"""Identifiers for a message of the estimate: CANopen leaves them free (CiA 301, 7.3.3)."""
+
 _STALE_CYCLES = 3
 """Cycles after which a height is stale: two frames in a row may be lost."""
 
@@ -384,11 +387,7 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
         item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.score >= LIKELY
     ]
     if not estimates:
-        return [
-            "# publish: no message looks like one for the estimate. Add one to the DBC, with a",
-            "# force and a bit that is 1 while it is valid, then:",
-            "# publish: {force: {message: M, signal: S}, valid: {message: M, signal: V}}",
-        ]
+        return _lines_of_own_message(database)
     best = estimates[0]
     lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
     # Where the validity has a message of its own, it is one of the same sender.
@@ -409,6 +408,23 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
         entry = f"{{message: {state[0].name}, signal: {state[1].name}}}"
         lines += ["status:", f"  state: {entry}"]
     return lines
+
+
+def _lines_of_own_message(database: Database) -> list[str]:
+    """A message for the estimate that the DBC lacks, and how it is published, as comments."""
+    used = {message.arbitration_id for message in database.messages.values()}
+    own = next(number for number in range(_FIRST_OWN_ID, _LAST_OWN_ID) if number not in used)
+    return [
+        "# No message of the DBC looks like one for the estimate, so it is not published. To publish",
+        "# it, add these three lines to the DBC, after its last message (BO_), with an identifier",
+        f"# that is free on your bus (here {own:#x}, which is {own}), and remove the # before publish:",
+        f"# BO_ {own} RIG_ESTIMATE: 5 Vector__XXX",
+        '#  SG_ FORCE : 0|32@1- (0.001,0) [-2000000|2000000] "N" Vector__XXX',
+        '#  SG_ VALID : 32|1@1+ (1,0) [0|1] "" Vector__XXX',
+        "# publish:",
+        "#   force: {message: RIG_ESTIMATE, signal: FORCE}",
+        "#   valid: {message: RIG_ESTIMATE, signal: VALID}",
+    ]
 
 
 def _publish_line(key: str, best: RankedSignal, found: Sequence[RankedSignal]) -> str:

@@ -57,6 +57,13 @@ def test_a_force_of_which_nothing_says_where_it_acts_is_left_to_the_user(rig, ca
     assert found["free_length_m"] == pytest.approx(0.36 + 24.0 * 9.81 / 9000.0)
 
 
+def test_a_free_length_of_a_drawing_is_taken(rig, tmp_path):
+    assert rig(*FACTS, "--free-length-m", "0.412") == 0
+    (strut,) = load_plan(tmp_path / "my.yaml").model.struts
+    assert strut.free_length_m == 0.412
+    assert "0.412   # as stated" in (tmp_path / "my_model.yaml").read_text()
+
+
 BOTH = 'CM_ SG_ 300 Force "Load cell between cylinder and carriage";\n'
 
 

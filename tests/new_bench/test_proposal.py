@@ -143,10 +143,23 @@ def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
     assert published == {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}}
 
 
-def test_nothing_is_published_into_a_message_that_is_not_for_an_estimate(dbc):
-    dbc.write_text(DBC.replace("EstimatedForce", "BrakeForceDemand"))
-    proposed = yaml.safe_load(propose(dbc))
-    assert "publish" not in proposed
+def test_a_message_that_is_not_for_an_estimate_is_left_and_one_of_its_own_is_shown(dbc, tmp_path):
+    used = DBC.replace("EstimatedForce", "BrakeForceDemand").replace("BO_ 400", "BO_ 1664")
+    dbc.write_text(used)
+    text = propose(dbc)
+    assert "publish" not in yaml.safe_load(text)
+    # As the comment says: three lines into the DBC, and the # before publish removed.
+    first = text.index("# BO_ 1665 RIG_ESTIMATE")
+    statements = text[first:].splitlines()[:3]
+    end = used.index("\n\n", used.index("BO_ 1664"))
+    own = "\n\n" + "\n".join(line.removeprefix("# ") for line in statements)
+    dbc.write_text(used[:end] + own + used[end:])
+    for line in text[first:].splitlines()[3:6]:
+        text = text.replace(line, line.removeprefix("# "))
+    (tmp_path / "my.yaml").write_text(text)
+    plan = load_plan(tmp_path / "my.yaml")
+    assert not errors(plan)
+    assert plan.config.publish["strut"]["valid"].signal == "VALID"
 
 
 def test_the_packages_own_dbc_gives_its_own_signals():
