@@ -415,9 +415,10 @@ def _lines_of_own_message(database: Database) -> list[str]:
     used = {message.arbitration_id for message in database.messages.values()}
     own = next(number for number in range(_FIRST_OWN_ID, _LAST_OWN_ID) if number not in used)
     return [
-        "# No message of the DBC looks like one for the estimate, so it is not published. To publish",
-        "# it, add these three lines to the DBC, after its last message (BO_), with an identifier",
-        f"# that is free on your bus (here {own:#x}, which is {own}), and remove the # before publish:",
+        "# No message of the DBC looks like one for the estimate, so it is not published. To",
+        "# publish it, add these three lines to the DBC, after its last message (BO_), with an",
+        f"# identifier that is free on your bus (here {own:#x}, that is {own}), and remove",
+        "# the # before publish and the two lines below it:",
         f"# BO_ {own} RIG_ESTIMATE: 5 Vector__XXX",
         '#  SG_ FORCE : 0|32@1- (0.001,0) [-2000000|2000000] "N" Vector__XXX',
         '#  SG_ VALID : 32|1@1+ (1,0) [0|1] "" Vector__XXX',
