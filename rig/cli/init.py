@@ -275,6 +275,8 @@ def _write(
         config.write_text(proposal.text(dbc, model_file.name), "utf-8")
     except OSError as error:
         model_file.unlink(missing_ok=True)
+        if not config.parent.is_dir():
+            raise InputError(f"--out {config}: no folder {config.parent}, make it first") from error
         raise InputError(f"--out {config}: cannot be written: {error.strerror}") from error
 
 

@@ -27,7 +27,7 @@ StrutName = Annotated[
 LengthNow = Annotated[
     float | None,
     typer.Option(
-        "--length-m", metavar="M", min=1e-4, max=100.0, help="Present length of the strut."
+        "--length-m", metavar="M", min=1e-4, max=100.0, help="Present length of the strut, in m."
     ),
 ]
 TareOf = Annotated[

@@ -81,6 +81,11 @@ class Force(Enum):
         """Its quantity."""
         return self.value
 
+    @property
+    def option(self) -> str:
+        """Option of `rig init` that names its signal."""
+        return "--applied-force" if self is Force.APPLIED else "--load-cell"
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -172,8 +177,7 @@ def find_force(database: Database, force: Force, named: str | None) -> Choice | 
     likeness = _force_likeness(force)
     ranked = rank_signals(database.messages.values(), likeness)
     if named is not None:
-        option = f"--{force.quantity.key.removesuffix('_force').replace('_', '-')}"
-        return _named(database, force.quantity, named, ranked, option)
+        return _named(database, force.quantity, named, ranked, force.option)
     likely = [item for item in ranked if item.score >= LIKELY]
     return _choice(force.quantity, likely[0], likely) if likely else None
 
@@ -223,7 +227,8 @@ def _named(
 ) -> Choice:
     message_name, dot, signal_name = name.partition(".")
     if not dot:
-        raise InputError(f"{option} {name}: expected MESSAGE.SIGNAL")
+        or_none = "" if quantity is HEIGHT else ", or none"
+        raise InputError(f"{option} {name}: expected MESSAGE.SIGNAL{or_none}")
     message = database.message(message_name)
     signal = message.signal(signal_name)
     if not measures(signal, quantity.dimension):
