@@ -209,7 +209,7 @@ POWER_DAMPING = _damper(
     name="power_damping",
     words="a non-linear damper (power law)",
     parameters=(
-        Parameter("force_at_1_m_per_s_n", "N", -1e18, 1e18, "force at 1 m/s"),
+        Parameter("force_at_1_m_per_s_n", "N", -1e18, 1e18, "force against the motion at 1 m/s"),
         Parameter("exponent", "", 0.3, 4.0, "exponent of the velocity"),
     ),
     force=_power,
@@ -239,7 +239,7 @@ DIRECTIONAL_DAMPING = _damper(
     parameters=(
         Parameter("compression_at_1_m_per_s_n", "N", -1e18, 1e18, "force in compression at 1 m/s"),
         Parameter("compression_exponent", "", 0.3, 4.0, "exponent of the velocity in compression"),
-        Parameter("rebound_at_1_m_per_s_n", "N", -1e18, 1e18, "force in rebound at 1 m/s"),
+        Parameter("rebound_at_1_m_per_s_n", "N", -1e18, 1e18, "pull in rebound at 1 m/s"),
         Parameter("rebound_exponent", "", 0.3, 4.0, "exponent of the velocity in rebound"),
     ),
     force=_directional,

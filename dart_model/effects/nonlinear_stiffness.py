@@ -140,7 +140,7 @@ POWER_STIFFNESS = _spring(
     name="power_stiffness",
     words="a non-linear spring (power law)",
     parameters=(
-        Parameter("force_at_100_mm_n", "N", -1e36, 1e36, "force at a deflection of 100 mm"),
+        Parameter("force_at_100_mm_n", "N", -1e36, 1e36, "force at a compression of 100 mm"),
         Parameter("exponent", "", 1.2, 8.0, "exponent of the deflection"),
     ),
     force=_power,

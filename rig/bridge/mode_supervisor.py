@@ -113,7 +113,8 @@ class Supervision(BaseModel):
             message, if these are longer.
         safe_after_s: Age of a height, of the applied force or (on a dyno) of the load cell's force
             from which the bridge enters the safe state. If three cycles of the applied force are
-            longer than `stale_after_s`, they extend this age, too, by the difference.
+            longer than `stale_after_s`, they extend this age for the applied force by the
+            difference.
         settling_s: Time after a start, a gap, a change of gains or a saturated virtual force until
             an estimate is valid. By default, with `pi`, the time after which the error that a step
             of the residual force causes in the closed loop has decayed to a hundredth of the step;
@@ -127,8 +128,8 @@ class Supervision(BaseModel):
             estimate, before the estimate is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
             output. With `fade_in_s` alone, the safe output is published at once in HOLD and SAFE.
-            With neither of the two keys, the model's force is published in HOLD, and the safe
-            output at once in SAFE.
+            With neither of the two keys, the estimate is published in HOLD (the last valid one
+            while the model starts again), and the safe output at once in SAFE.
         watchdog: Whether a second process sends the safe output if the loop stands still for
             `safe_after_s` or its process dies; only on interfaces that several processes can share.
         log_fault: Reaction to a log that cannot be written: `continue`, or `safe` for the safe

@@ -324,8 +324,9 @@ class RunConfig(_Frozen):
         observers: Observer of each strut, by strut name; `pi` for a strut without an entry. A dyno
             uses no observer. The section Observers of this page lists the keys of each kind.
         publish: Signals that carry the quantities of each strut, by strut name and by the keys of
-            the published quantities. By default RIG_ESTIMATE and RIG_KINEMATICS, if the DBC has
-            them, for the first strut, and these names with _2, _3, ... for the next ones.
+            the published quantities. By default RIG_ESTIMATE, RIG_KINEMATICS and (with `kalman`)
+            RIG_UNCERTAINTY, if the DBC has them, for the first strut, and these names with _2, _3,
+            ... for the next ones.
         status: Signals that carry the state of the bridge, by the keys of the published quantities,
             or the name of a message with the default signals. By default RIG_STATUS, if the DBC has
             it.

@@ -304,12 +304,11 @@ def _applied_force(plan: Plan) -> list[Finding]:
     if channel is None:
         return []
     stale_ns = plan.config.supervision.stale_after_ns
-    if _message(channel).cycle_time_ns is None:
-        text = f"missing after {stale_ns * 1e-6:g} ms: the DBC gives {_message(channel).name} no "
-        text += "cycle time"
-        return [Finding(Severity.WARNING, channel.key, text)]
     grace_ns = grace_of_applied_force_ns([channel], stale_ns)
     text = f"missing after {(stale_ns + grace_ns) * 1e-6:g} ms"
+    if _message(channel).cycle_time_ns is None:
+        text += f": the DBC gives {_message(channel).name} no cycle time"
+        return [Finding(Severity.WARNING, channel.key, text)]
     is_long = stale_ns + grace_ns > plan.config.supervision.safe_after_ns
     severity = Severity.WARNING if is_long else Severity.OK
     return [Finding(severity, channel.key, text)]

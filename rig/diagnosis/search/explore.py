@@ -49,9 +49,14 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
     first = None
     if len(pool.fits) > 1:
         _expand_best(pool, progress)
+        known = pool.least().fit.candidate
+        _try_damper_with_friction(pool)
+        if pool.least().fit.candidate != known:
+            # Its other laws were chosen beside a damper or friction that imitated both.
+            _expand_best(pool, progress)
     else:
         first = _search_along_motion(pool, progress)
-    _try_damper_with_friction(pool)
+        _try_damper_with_friction(pool)
     pool.converge_best()
     return first
 
