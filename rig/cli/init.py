@@ -228,6 +228,9 @@ def _find_signals(
         }
     open_forces = [force for force, name in names.items() if name is None and not forces[force]]
     unclear = unclear_forces(database, [it for it in forces.values() if it]) if open_forces else []
+    if is_dyno and len(unclear) == 1 and not forces[Force.IN_STRUT]:
+        # A dyno measures no other force.
+        forces[Force.IN_STRUT] = find_force(database, Force.IN_STRUT, unclear.pop().name)
     if unclear and sys.stdin.isatty():
         for item in unclear[: len(open_forces)]:
             force = _ask_place(item.name)
@@ -342,8 +345,9 @@ def _print(
         print_text(f"{choice.quantity.key}: {choice.name} ({choice.comment})")
     for item in signals.unclear:
         print_text(
-            f"{item.name} is a force, and it is not clear where it acts: --applied-force "
-            f"{item.name} for one on the body, --load-cell {item.name} for one in the strut"
+            f"{item.name} is a force, and it is not clear where it acts. To use it, delete the two "
+            f"files and add --applied-force {item.name} for a force on the body, or --load-cell "
+            f"{item.name} for one in the strut"
         )
     for what, why in database.passed_over.items():
         print_text(f"Passed over in {database.path.name}: {what}: {why}")

@@ -43,10 +43,11 @@ _UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
 _LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
 """Rates of the bridge: that of the height where it lies between, else the usual one."""
 
-_VALID_WORDS, _OK_CHOICES = ("valid", "gueltig", "qual", "ok"), ("ok", "valid", "good", "gueltig")
+_VALID_WORDS = ("valid", "gueltig", "qual", "ok", "healthy")
+_OK_CHOICES = ("ok", "valid", "good", "gueltig", "healthy")
 _WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
-_COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount")
+_COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount", "seq")
 _STATE_WORDS = ("state", "mode", "status", "zustand")
 _LEAST_STATE_BITS = 3
 """A mode is a number from 0 to 6."""
@@ -161,9 +162,11 @@ def find_height(database: Database, named: str | None) -> Choice:
     if ranked[0].score < LIKELY:
         lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
         more = ", ..." if len(ranked) > _MOST_OTHERS else ""
+        counts = signal_ranking.counts(messages)[:_MOST_OTHERS]
         raise InputError(
             f"{database.path}: no length looks like the height of a strut (there are {lengths}"
             f"{more}): name it with --height MESSAGE.SIGNAL"
+            + "".join(f". If it is {full_name(*item)}: {_ask_for_unit(*item)}" for item in counts)
         )
     return _choice(HEIGHT, ranked[0], ranked)
 
@@ -233,12 +236,24 @@ def _named(
     signal = message.signal(signal_name)
     if not measures(signal, quantity.dimension):
         names = [item.name for item in ranked]
+        unit = f"has the unit {signal.unit!r}" if signal.unit else "has no unit"
+        if quantity is HEIGHT and signal_ranking.is_count(signal):
+            raise InputError(f"{option} {name}: {unit}: {_ask_for_unit(message, signal)}")
         raise InputError(
-            f"{option} {name}: has the unit {signal.unit!r}, expected one of "
-            f"{quantity.dimension.name.lower()}"
+            f"{option} {name}: {unit}, expected one of {quantity.dimension.name.lower()}"
             + (f": {expected_name(name, names)}" if names else "")
         )
     return Choice(quantity, message, signal, "as named", ())
+
+
+def _ask_for_unit(message: Message, signal: Signal) -> str:
+    """What to write into the DBC for a position that is counted."""
+    kind = f"{'0' if signal.is_big_endian else '1'}{'-' if signal.is_signed else '+'}"
+    return (
+        f"state in {message.name}, in a copy of the DBC, how long a count is. For counts of 0.01 "
+        f"mm: `SG_ {signal.name} : {signal.start}|{signal.length_bits}@{kind} (0.01,0) [0|0] "
+        '"mm"`, then its receivers as before'
+    )
 
 
 def _choice(quantity: Quantity, best: RankedSignal, ranked: Sequence[RankedSignal]) -> Choice:

@@ -27,6 +27,12 @@ _LETTERS_OF_A_PART = 5
 _CLEAR_WORD = 2.0
 """Weight of a word that says by itself what a signal is."""
 
+_LEAST_BITS = 12
+"""Of a position that is counted: 4096 steps over a stroke."""
+
+_OTHERS = ("%", "V", "mV", "A", "mA", "bar", "Pa", "kPa", "MPa", "deg", "rad", "Hz", "rpm", "1/min")
+"""Units of other quantities of a bench."""
+
 _FAST_S, _SLOW_S = 0.02, 0.2
 """Cycles of a sensor by which a strut can be followed, and of one by which it cannot."""
 
@@ -72,7 +78,8 @@ def _weights(**weighted: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for key, words in weighted.items():
         sign, _, size = key.partition("_")
-        found |= dict.fromkeys(words.split(), float(size) * (1 if sign == "plus" else -1))
+        weight = float(size.replace("_", "."))
+        found |= dict.fromkeys(words.split(), weight if sign == "plus" else -weight)
     return found
 
 
@@ -82,7 +89,7 @@ HEIGHT = Likeness(
         plus_3="susp suspension damper daempfer shock strut stroke lvdt drawwire linpot federweg "
         "einfederung federbein ridehgt rideheight ride wire potentiometer pot jounce",
         plus_2="height hght hoehe travel displacement displ stringpot weg wegsensor level niveau",
-        plus_1="pos position length laenge hub spring feder corner axle achse",
+        plus_1="pos position length laenge hub spring feder corner axle achse encoder enc",
         minus_4="odo odometer distance dist trip range reichweite altitude gps latitude longitude "
         "lane radar object obj target curve kurve snow rain urea fuel tank tire tyre circumference "
         "throttle brake pedal clutch steer steering rack valve camera cam parking obstacle "
@@ -100,13 +107,16 @@ _NO_BENCH_FORCE = (
     "regen wheel trailer drawbar fifthwheel limit max min"
 )
 
+_NOT_MEASURED = "cmd command setpoint soll demand request target"
+
 APPLIED_FORCE = Likeness(
     Dimension.FORCE,
     _weights(
         plus_3="applied excitation erreger anregung shaker actuator aktor cylinder zylinder "
         "exciter input carriage",
         plus_1="act force kraft drive piston hydraulic servo",
-        minus_2="load cell loadcell strut damper kmd messdose estimate estimated cmd setpoint soll",
+        minus_2="strut damper estimate estimated",
+        minus_3=_NOT_MEASURED,
         minus_4=_NO_BENCH_FORCE,
     ),
 )
@@ -114,10 +124,12 @@ APPLIED_FORCE = Likeness(
 STRUT_FORCE = Likeness(
     Dimension.FORCE,
     _weights(
-        plus_3="loadcell load cell strut damper daempfer kmd messdose shock susp suspension",
-        plus_1="force kraft meas measured ist sensor",
-        minus_2="applied excitation shaker actuator aktor cylinder zylinder estimate estimated cmd "
-        "setpoint soll carriage",
+        # A load cell may be in the strut or at the cylinder.
+        plus_3="load_cell strut damper daempfer shock susp suspension",
+        plus_0_5="force kraft meas measured ist sensor loadcell load cell kmd messdose",
+        minus_2="applied excitation shaker actuator aktor cylinder zylinder estimate estimated "
+        "carriage",
+        minus_3=_NOT_MEASURED,
         minus_4=_NO_BENCH_FORCE,
     ),
 )
@@ -168,6 +180,26 @@ def words_without_unit(messages: Iterable[Message], likeness: Likeness) -> list[
         if (weights := _words(likeness.words, signal.name)) and sum(weights.values()) >= _CLEAR_WORD
     ]
     return [name for _, name in sorted(found, key=lambda item: -item[0])]
+
+
+def counts(messages: Iterable[Message]) -> list[tuple[Message, Signal]]:
+    """Signals whose unit is none of a quantity, as that of an encoder's increments: fast and fine.
+
+    Counters and checksums have too few bits, a mileage is sent too rarely.
+    """
+    return [
+        (message, signal)
+        for message in messages
+        if message.cycle_time_ns is None or message.cycle_time_ns * 1e-9 <= _FAST_S
+        for signal in message.signals.values()
+        if signal.unit and signal.length_bits >= _LEAST_BITS and is_count(signal)
+    ]
+
+
+def is_count(signal: Signal) -> bool:
+    """Whether a signal has no unit, or one of no quantity, such as increments."""
+    units = (dimension for dimension in Dimension if dimension is not Dimension.NUMBER)
+    return signal.unit not in _OTHERS and not any(measures(signal, unit) for unit in units)
 
 
 def full_name(message: Message, signal: Signal) -> str:

@@ -64,23 +64,40 @@ def test_a_free_length_of_a_drawing_is_taken(rig, tmp_path):
     assert "0.412   # as stated" in (tmp_path / "my_model.yaml").read_text()
 
 
-BOTH = 'CM_ SG_ 300 Force "Load cell between cylinder and carriage";\n'
+BETWEEN = 'CM_ SG_ 300 Force "Load cell between cylinder and carriage";\n'
+
+
+def test_a_load_cell_at_the_cylinder_measures_the_applied_force(rig, tmp_path, capsys):
+    text = (tmp_path / "my.dbc").read_text()
+    (tmp_path / "my.dbc").write_text(text + BETWEEN)
+    assert rig(*FACTS, "--json") == 0
+    signals = json.loads(capsys.readouterr().out)["signals"]
+    assert signals["applied_force"]["signal"] == "Force"
+    assert "load_cell_force" not in signals
+
+
+def test_a_load_cell_of_which_nothing_says_where_it_is_is_left_to_the_user(rig, tmp_path, capsys):
+    text = (tmp_path / "my.dbc").read_text()
+    (tmp_path / "my.dbc").write_text(text + 'CM_ SG_ 300 Force "Load cell, see the sheet";\n')
+    assert rig(*FACTS, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["unclear_forces"] == ["CELL.Force"]
 
 
 def test_a_force_that_suits_both_places_is_mapped_to_the_one_that_is_named(rig, tmp_path, capsys):
     text = (tmp_path / "my.dbc").read_text()
-    (tmp_path / "my.dbc").write_text(text + BOTH)
+    (tmp_path / "my.dbc").write_text(text.replace("SG_ Force", "SG_ ShockInput"))
     assert rig(*FACTS, "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    assert "CELL.Force" in found["unclear_forces"]
+    assert "CELL.ShockInput" in found["unclear_forces"]
     assert not {"applied_force", "load_cell_force"} & set(found["signals"])
     for file in ("my.yaml", "my_model.yaml"):
         (tmp_path / file).unlink()
-    assert rig(*FACTS, "--applied-force", "CELL.Force", "--load-cell", "CELL.Force") == 2
-    assert "--load-cell CELL.Force: is the applied force" in capsys.readouterr().err
-    assert rig(*FACTS, "--applied-force", "CELL.Force") == 0
+    assert rig(*FACTS, "--applied-force", "CELL.ShockInput", "--load-cell", "CELL.ShockInput") == 2
+    assert "--load-cell CELL.ShockInput: is the applied force" in capsys.readouterr().err
+    assert rig(*FACTS, "--applied-force", "CELL.ShockInput") == 0
     signals = load_plan(tmp_path / "my.yaml").config.signals
-    assert signals.applied_force.signal == "Force"
+    assert signals.applied_force.signal == "ShockInput"
     assert [quantity.key for quantity in signals.bench if "force" in quantity.key] == [
         "applied_force"
     ]
@@ -119,10 +136,17 @@ def test_stiffness_and_damping_of_a_recording(rig, tmp_path, capsys):
 
 
 def test_a_dyno_needs_a_load_cell(rig, tmp_path, capsys):
-    facts = FACTS[2:]
+    facts, path = FACTS[2:], tmp_path / "my.dbc"
+    text = path.read_text()
+    second = ' SG_ Other : 16|16@1- (0.1,0) [0|0] "daN" CONTROL\n\nBO_ 400'
+    path.write_text(text.replace("\nBO_ 400", second, 1))
     assert rig(*facts, "--dyno") == 2
     assert "--dyno: requires the force in the strut: --load-cell" in capsys.readouterr().err
     assert rig(*facts, "--dyno", "--load-cell", "CELL.Force") == 0
+    for file in ("my.yaml", "my_model.yaml"):
+        (tmp_path / file).unlink()
+    path.write_text(text)  # whose only force it is
+    assert rig(*facts, "--dyno") == 0
     plan = load_plan(tmp_path / "my.yaml")
     assert plan.config.prescribed_motion is not None
     assert not errors(plan)

@@ -102,6 +102,13 @@ def test_a_dbc_without_a_height_is_answered_by_what_to_do(dbc):
         match=r"my\.dbc: no signal has a unit of length, .*M1\.ShockPot, give it its unit",
     ):
         find_height(load_database(write(dbc, {"ShockPot": '(1,0) [0|0] ""'})), None)
+    increments = {"Odometer": '(0.001,0) [0|65] "km"', "Pos": '(1,0) [0|0] "inc"'}
+    database = load_database(write(dbc, increments))
+    with pytest.raises(InputError, match=r"it is M2\.Pos: state in M2, in a copy of the DBC"):
+        find_height(database, None)
+    # As the message says.
+    with pytest.raises(InputError, match=r"`SG_ Pos : 0\|16@1- \(0\.01,0\) \[0\|0\] \"mm\"`"):
+        find_height(database, "M2.Pos")
     database = load_database(write(dbc, {"ShockPot": MM, "Force": '(1,0) [0|0] "N"'}))
     assert find_height(database, "M1.ShockPot").why == "as named"
     with pytest.raises(InputError, match=r"--height M2\.Force: has the unit 'N', .* of length"):
