@@ -24,7 +24,6 @@ from rig.channels.measured_quantities import (
 )
 from rig.new_bench import signal_ranking
 from rig.new_bench.signal_ranking import (
-    LIKELY,
     Likeness,
     RankedSignal,
     full_name,
@@ -49,6 +48,9 @@ _WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
 _COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount", "seq")
 _STATE_WORDS = ("state", "mode", "status", "zustand")
+_ELSEWHERE = -1.0
+"""Score below which a force is that of another place, such as a brake's, or a command."""
+
 _LEAST_STATE_BITS = 3
 """A mode is a number from 0 to 6."""
 
@@ -159,7 +161,7 @@ def find_height(database: Database, named: str | None) -> Choice:
                 else ": is this the DBC of the bench? `rig sensor scan` finds sensors without one"
             )
         )
-    if ranked[0].score < LIKELY:
+    if not ranked[0].is_likely:
         lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
         more = ", ..." if len(ranked) > _MOST_OTHERS else ""
         counts = signal_ranking.counts(messages)[:_MOST_OTHERS]
@@ -181,7 +183,7 @@ def find_force(database: Database, force: Force, named: str | None) -> Choice | 
     ranked = rank_signals(database.messages.values(), likeness)
     if named is not None:
         return _named(database, force.quantity, named, ranked, force.option)
-    likely = [item for item in ranked if item.score >= LIKELY]
+    likely = [item for item in ranked if item.is_likely]
     return _choice(force.quantity, likely[0], likely) if likely else None
 
 
@@ -192,20 +194,19 @@ def unclear_forces(database: Database, taken: Iterable[Choice]) -> list[RankedSi
     """
     messages = list(database.messages.values())
     names = {choice.name for choice in taken}
-    names |= {
-        it.name for it in rank_signals(messages, signal_ranking.ESTIMATE) if it.score >= LIKELY
-    }
+    names |= {it.name for it in rank_signals(messages, signal_ranking.ESTIMATE) if it.is_likely}
     ranked = [
         sorted(rank_signals(messages, kind), key=lambda item: item.name)
         for kind in (signal_ranking.APPLIED_FORCE, signal_ranking.STRUT_FORCE)
     ]
     found = [max(same, key=lambda item: item.score) for same in zip(*ranked, strict=True)]
-    likely = [{it.name for it in same if it.score >= LIKELY} for same in ranked]
+    likely = [{it.name for it in same if it.is_likely} for same in ranked]
     suits_both = likely[0] & likely[1]
     free = [
         item
         for item in found
-        if item.name not in names and (-1.0 < item.score < LIKELY or item.name in suits_both)
+        if item.name not in names
+        and ((item.score > _ELSEWHERE and not item.is_likely) or item.name in suits_both)
     ]
     return sorted(free, key=lambda item: -item.score)
 
@@ -216,7 +217,7 @@ def find_temperature(database: Database, sender: str | None) -> Choice | None:
     likely = [
         item
         for item in ranked
-        if item.score >= LIKELY or (item.score > 0.0 and item.message.sender == sender)
+        if item.is_likely or (item.score > 0.0 and item.message.sender == sender)
     ]
     return _choice(TEMPERATURE, likely[0], likely) if likely else None
 
@@ -403,9 +404,7 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
     messages = [item for item in database.messages.values() if item.name not in listened]
     # A DBC that names no nodes does not determine who sends what.
     free = [item for item in messages if item.sender != bench] or messages
-    estimates = [
-        item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.score >= LIKELY
-    ]
+    estimates = [item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.is_likely]
     if not estimates:
         return _lines_of_own_message(database)
     best = estimates[0]

@@ -45,12 +45,17 @@ class Likeness:
         words: Weights of words in names; negative for what is measured elsewhere.
         spans: Spans of a range in SI that are usual, that are possible.
         step: Largest step in SI that is of use.
+        likely: Least score of a signal that is proposed: a clear word, or unit, range and cycle
+            together.
+        cycle_weight: Weight of the message's cycle.
     """
 
     dimension: Dimension
     words: Mapping[str, float]
     spans: tuple[tuple[float, float], tuple[float, float]] | None = None
     step: float | None = None
+    likely: float = 3.0
+    cycle_weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ class RankedSignal:
     message: Message
     signal: Signal
     score: float
+    is_likely: bool
     reasons: tuple[str, ...]
 
     @property
@@ -107,6 +113,10 @@ _NO_BENCH_FORCE = (
     "regen wheel trailer drawbar fifthwheel limit max min"
 )
 
+_CLEAR_FORCE, _HARDLY = 1.5, 0.1
+"""Of a force, a clear word at least in a comment has to say where it acts; its cycle only orders
+forces of which that is known."""
+
 _NOT_MEASURED = "cmd command setpoint soll demand request target"
 
 APPLIED_FORCE = Likeness(
@@ -114,11 +124,13 @@ APPLIED_FORCE = Likeness(
     _weights(
         plus_3="applied excitation erreger anregung shaker actuator aktor cylinder zylinder "
         "exciter input carriage",
-        plus_1="act force kraft drive piston hydraulic servo",
+        plus_0_5="act force kraft drive piston hydraulic servo",
         minus_2="strut damper estimate estimated",
         minus_3=_NOT_MEASURED,
         minus_4=_NO_BENCH_FORCE,
     ),
+    likely=_CLEAR_FORCE,
+    cycle_weight=_HARDLY,
 )
 
 STRUT_FORCE = Likeness(
@@ -132,6 +144,8 @@ STRUT_FORCE = Likeness(
         minus_3=_NOT_MEASURED,
         minus_4=_NO_BENCH_FORCE,
     ),
+    likely=_CLEAR_FORCE,
+    cycle_weight=_HARDLY,
 )
 
 TEMPERATURE = Likeness(
@@ -153,9 +167,6 @@ ESTIMATE = Likeness(
         minus_2="measured meas cell load ist setpoint soll max min limit right",
     ),
 )
-
-LIKELY = 3.0
-"""Least score of a signal that is proposed: a clear word, or unit, range and cycle together."""
 
 
 def rank_signals(messages: Iterable[Message], likeness: Likeness) -> list[RankedSignal]:
@@ -230,11 +241,11 @@ def _score(message: Message, signal: Signal, likeness: Likeness) -> RankedSignal
         _unit_score(signal, likeness),
         _range_score(message, signal, likeness),
         _step_score(message, signal, likeness),
-        _cycle_score(message),
+        _cycle_score(message, likeness),
     ):
         score += found
         reasons += [why] if why else []
-    return RankedSignal(message, signal, score, tuple(reasons))
+    return RankedSignal(message, signal, score, score >= likeness.likely, tuple(reasons))
 
 
 _Scored = tuple[float, str]
@@ -274,14 +285,14 @@ def _step_score(message: Message, signal: Signal, likeness: Likeness) -> _Scored
     return 0.5, f"steps of {step * 1e3:.3g} mm" if step else ""
 
 
-def _cycle_score(message: Message) -> _Scored:
+def _cycle_score(message: Message, likeness: Likeness) -> _Scored:
     if message.cycle_time_ns is None:
         return 0.0, ""
     cycle_s = message.cycle_time_ns * 1e-9
     why = f"every {cycle_s * 1e3:g} ms"
     if cycle_s <= _FAST_S:
-        return 1.0, why
-    return (-1.0, why) if cycle_s >= _SLOW_S else (0.0, why)
+        return likeness.cycle_weight, why
+    return (-likeness.cycle_weight if cycle_s >= _SLOW_S else 0.0), why
 
 
 def _words(weights: Mapping[str, float], text: str) -> dict[str, float]:

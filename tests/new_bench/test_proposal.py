@@ -134,6 +134,14 @@ def test_a_force_is_mapped_only_where_it_is_clear_where_it_acts(dbc):
     assert find_force(database, Force.APPLIED, None) is None
     assert find_force(database, Force.IN_STRUT, None) is None
     assert [item.name for item in unclear_forces(database, [])] == ["M2.Force"]
+    fast = "".join(f'BA_ "GenMsgCycleTime" BO_ {number} 1;' for number in (1, 2, 3))
+    named = {"Stroke": MM, "ForceAct": N, "MeasuredForce": N}
+    database = load_database(write(dbc, named, fast))
+    assert {item.name for item in unclear_forces(database, [])} == {
+        "M2.ForceAct",
+        "M3.MeasuredForce",
+    }
+    write(dbc, {"Stroke": MM, "Force": N, "BrakeForce": N})
     text = propose(dbc)
     assert "# M2.Force: a force; applied_force (on the body) or load_cell_force?" in text
     assert set(yaml.safe_load(text)["signals"]) == {"height"}
