@@ -28,7 +28,7 @@ period.
 
 Only the two runs of one pair are comparable: from pair to pair the load of the machine changes, and
 with it the number of missed ticks changes more than it differs between the two loops. The rows
-below the sum divide the sum by the part of the loop in which the time was lost and by the cause,
+below the sum break it down by the part of the loop in which the time was lost and by the cause,
 which `rig timing` determines from the kernel's accounting. The parts of the loop are receive,
 compute, send, log, between (what the loop does after the log, before it waits) and wait.
 """

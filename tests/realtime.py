@@ -45,8 +45,9 @@ CLASSIC_CAN_HZ = 3703
 MOST_ERROR = 0.02
 
 TEXT = """
-Bridge and simulated bench run in one process, on a virtual bus, in real time: one frame in and one
-frame out per tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted} SCHED_FIFO.
+Bridge and simulated bench run in one process, on a virtual bus, in real time: at least one frame in
+and one frame out per tick, at {rate_hz:g} Hz for {seconds:g} s. {load} The loop ran {granted}
+SCHED_FIFO.
 
 The lateness is the time from a tick's deadline to the wake-up of the loop; the work (computing
 time) is the time from the wake-up to the end of the tick. A missed tick is counted and not made up

@@ -197,7 +197,13 @@ QUADRATIC_DAMPING = _damper(
     name="quadratic_damping",
     words="a non-linear damper (quadratic, orifice flow)",
     parameters=(
-        Parameter("damping_n_s2_per_m2", "N·s²/m²", -1e18, 1e18, "force per squared velocity"),
+        Parameter(
+            "damping_n_s2_per_m2",
+            "N·s²/m²",
+            -1e18,
+            1e18,
+            "force against the motion per squared velocity",
+        ),
     ),
     force=_quadratic,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.9, orifice flow",
@@ -354,7 +360,13 @@ STROKE_DAMPING = _damper(
     name="stroke_damping",
     words="a non-linear damper (damping proportional to the deflection)",
     parameters=(
-        Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per metre of deflection"),
+        Parameter(
+            "damping_n_s_per_m2",
+            "N·s/m²",
+            -1e18,
+            1e18,
+            "damping per metre of height above the free length",
+        ),
     ),
     force=_over_stroke,
     excitation=_PLACES,

@@ -10,7 +10,11 @@ _WIDE = "deflections from the free length that differ by a factor of three or mo
 _LARGEST_EXPONENT = 40.0
 _GAS = (
     Parameter(
-        "gas_length_m", "m", 1e-12, 1e4, "ratio of gas volume to piston area, at the free length"
+        "gas_length_m",
+        "m",
+        1e-12,
+        1e4,
+        "ratio of gas volume to piston area (in a damper: to rod area), at the free length",
     ),
     Parameter("polytropic_exponent", "", 1.0, 3.0, "1: isothermal, 1.4: adiabatic (air)"),
 )
@@ -97,7 +101,13 @@ QUADRATIC_STIFFNESS = _spring(
     name="quadratic_stiffness",
     words="a non-linear spring (quadratic)",
     parameters=(
-        Parameter("stiffness_n_per_m2", "N/m²", -1e18, 1e18, "force per squared deflection"),
+        Parameter(
+            "stiffness_n_per_m2",
+            "N/m²",
+            -1e18,
+            1e18,
+            "pull per squared deflection, on both sides of the free length",
+        ),
     ),
     force=_quadratic,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
@@ -110,7 +120,9 @@ CUBIC_STIFFNESS = _spring(
     name="cubic_stiffness",
     words="a non-linear spring (cubic, about the free length)",
     parameters=(
-        Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
+        Parameter(
+            "stiffness_n_per_m3", "N/m³", -1e24, 1e24, "restoring force per cubed deflection"
+        ),
     ),
     force=_cubic,
     reference="Duffing, Erzwungene Schwingungen bei veränderlicher Eigenfrequenz (1918)",
@@ -124,7 +136,9 @@ CENTRED_CUBIC_STIFFNESS = _spring(
     name="centred_cubic_stiffness",
     words="a non-linear spring (cubic, about a centre height)",
     parameters=(
-        Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
+        Parameter(
+            "stiffness_n_per_m3", "N/m³", -1e24, 1e24, "restoring force per cubed deflection"
+        ),
         Parameter("centre_height_m", "m", -1e4, 1e4, "height at which the force is zero"),
     ),
     force=_centred_cubic,

@@ -38,7 +38,13 @@ Dbc = Annotated[
     Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
 ]
 Duration = Annotated[
-    float | None, typer.Option(metavar="S", min=0.001, help="Duration; until Ctrl-C by default.")
+    float | None,
+    typer.Option(
+        metavar="S",
+        min=0.001,
+        help="Duration; by default until Ctrl-C, or with --lockstep that of the bridge's "
+        "configuration, if it states one.",
+    ),
 ]
 Bridge = Annotated[
     Path | None,

@@ -92,7 +92,8 @@ def scan_command(
 ) -> None:
     """Find the CANopen and J1939 sensors on a bus; with --out, write a DBC and a configuration.
 
-    The device type is requested from every CANopen node id, the PDO mapping from each device, and
+    The device type is requested from every CANopen node id, the objects that describe it (such as
+    the PDO mapping) from each device, the identity from a device without a node id (LSS), and
     address claims from J1939 devices; nothing is changed. On a bus with other devices, for which
     these requests may have another meaning, use --listen-only.
     """

@@ -20,7 +20,7 @@ EXIT_CODES = {
     "ticks; a check, a replay, a comparison with a master or a tolerance band, or a run of a fleet "
     "failed; or a run's files are damaged.",
     WRONG_INPUT: "An input is wrong: one line on standard error names file, key, value and what "
-    "was expected.",
+    "was expected. (`rig import` of a folder names each refused file on standard output.)",
     130: "Interrupted by Ctrl-C. (Ctrl-C ends a run properly, with one of the codes above.)",
 }
 """Exit codes of all commands, with their meanings."""

@@ -338,8 +338,8 @@ class Temperature(_Section):
     Attributes:
         initial_c: Temperature at the start in degrees Celsius.
         ambient_c: Temperature of the air in degrees Celsius.
-        heat_capacity_j_per_k: Heat capacity of the damper in J/K; if absent, the temperature is
-            constant.
+        heat_capacity_j_per_k: Heat capacity of the damper in J/K; if absent, the dissipated power
+            does not heat the damper.
         cooling_time_s: Time constant of cooling in s; if absent, the damper does not cool.
     """
 

@@ -37,9 +37,12 @@ is named there is counted apart."""
 
 TEXT = f"""
 Recordings are simulated on benches with known truth, by a generator with its own equations of
-motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno; the
-nominal model is exact (apart from these effects) or rough: its stiffness is wrong by up to 20 %,
-its damping by up to 40 %, mass and preload by up to 5 %, and the applied force by up to 2 %.
+motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno. The
+RMS force of each planted effect is at least five times (in `outside` ten times) that which sensor
+noise alone feigns below 25 Hz. The nominal model is exact (apart from these effects) or rough: its
+stiffness is wrong by up to 20 %, its damping by up to 40 %, its mass by up to 5 %, the measured
+applied force by up to 2 %, and a preload of up to 5 % of the weight (on a dyno, of the strut force)
+is missing.
 
 `single`, `pair` and `triple` are groups with one, two and three planted effects; `complete` has
 none. In `foreign`, the planted force has a formula that `rig` does not contain; in `outside`, none
@@ -49,8 +52,8 @@ rough nominal model, unless the planted effect is linear. With a rough nominal m
 effect, `explained` is right, because linear corrections explain the data. The rows in italics
 combine several groups.
 
-{{groups}} With `--one-of N` in the command at the end of the page, one
-case of N was run in each group.
+{{groups}} With `--one-of N` in the command at the end of the page,
+about one case of N was run in each group, and at least one.
 
 A case counts as right if
 

@@ -16,12 +16,12 @@ FOLDER = Path(__file__).parent
 
 FAULTS_TEXT = """
 The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
-fault. Faults of frames, bench and devices are injected in simulated time, 2 s after the start;
-faults of disk and process in real runs. *Within* is the time from the fault to the first tick that
-shows it (for a stuck value and a bench that stops sending, to the safe state); *loss* states which
-data are lost. The force error is the RMS difference to the simulated bench over the valid ticks; it
-is compared with that of the same run without the fault. Combinations of faults are not in this
-table.
+fault. Faults of frames, bench, bus, clock and devices are injected in simulated time, 2 s after the
+start; faults of disk and process in runs with a log on the disk. *Within* is the time from the
+fault to the first tick that shows it (for a stuck value and a bench that stops sending, to the safe
+state); *loss* states which data are lost. The force error is the RMS difference to the simulated
+bench over the valid ticks; it is compared with that of the same run without the fault. Combinations
+of faults are not in this table.
 """
 
 PROMISE_TEXT = """
@@ -34,6 +34,7 @@ error of more than three times the largest error of the settled run.
 - *First invalid frame* and *valid again* are times since the event; these and the modes are those
   of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent every 100 ms: a
   mode that begins and ends between two of these frames is not listed.
+- *Then acknowledged*: the safe state is acknowledged 0.9 s after the event, and again every second.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
   published gains / a damped PI observer / the noise-aware observer.
 - In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the

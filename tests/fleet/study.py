@@ -35,7 +35,7 @@ A fleet of {RUNS} simulated dyno runs ({DAMPERS} dampers on {BENCHES} benches, {
 cluster of {WORKERS} workers, one of which is killed after a third of the runs, and with {CORES}
 processes. The throughput is compared with that of plain loops, which diagnose one run after the
 other: {CORES} such loops run simultaneously, one per core; together they diagnose {singles} runs,
-each run once.
+each once, after a first diagnosis in each loop that is not timed.
 
 The cost of distribution is the CPU time of the campaign's process, which distributes the runs and
 writes the store, plus that of Dask's scheduler. The overhead inside the workers is not counted. The
