@@ -67,7 +67,13 @@ Mass = Annotated[
 ]
 LengthAtRest = Annotated[
     float | None,
-    typer.Option(metavar="M", min=1e-3, max=100.0, help="Length of the strut at rest, in m."),
+    typer.Option(
+        metavar="M",
+        min=1e-3,
+        max=100.0,
+        help="Length of the strut at rest, in m: under the weight of the mass, without an "
+        "applied force; with --dyno without a force.",
+    ),
 ]
 FreeLength = Annotated[
     float | None,
@@ -149,6 +155,12 @@ def init(
     refuse_existing(out, model_file, option="--out ")
     if run is not None and listen_s is not None:
         raise InputError("expected one of --run and --listen-s")
+    is_measured = run is not None or listen_s is not None
+    if is_measured and (stiffness_n_per_m, damping_n_s_per_m) != (None, None):
+        raise InputError(
+            "--run and --listen-s estimate stiffness and damping, expected none of "
+            "--stiffness-n-per-m and --damping-n-s-per-m with them"
+        )
     database = load_database(dbc)
     signals = _find_signals(database, height, applied_force, load_cell, is_dyno=is_dyno)
     proposal = Proposal(database, signals, BusConfig(interface, channel, bitrate), is_dyno)
@@ -158,13 +170,15 @@ def init(
     length_at_rest_m = _known(
         length_at_rest_m, "--length-at-rest-m", "Length of the strut at rest, by a rule, m", None
     )
-    if run is None and listen_s is None:
+    if not is_measured:
         stiffness_n_per_m = _known(
             stiffness_n_per_m, "--stiffness-n-per-m", "Stiffness, roughly, N/m", None
         )
     model, source = _first_model(mass_kg, length_at_rest_m, stiffness_n_per_m, damping_n_s_per_m)
+    if free_length_m is None and is_dyno:
+        free_length_m = length_at_rest_m  # no weight rests on the strut
     model = replace(model, stated_free_length_m=free_length_m)
-    if run is not None or listen_s is not None:
+    if is_measured:
         fit = _measure(proposal, model, run, listen_s)
         model = replace(
             model,

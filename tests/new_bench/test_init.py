@@ -133,6 +133,7 @@ def test_stiffness_and_damping_of_a_recording(rig, tmp_path, capsys):
     (body,) = model.skeleton.bodies
     assert body.mass_kg == MASS_KG
     assert "from sweep.csv, explaining 100% of it" in (tmp_path / "my_model.yaml").read_text()
+    assert rig(*FACTS, "--run", "sweep.csv") == 2
 
 
 def test_a_dyno_needs_a_load_cell(rig, tmp_path, capsys):
@@ -147,6 +148,8 @@ def test_a_dyno_needs_a_load_cell(rig, tmp_path, capsys):
         (tmp_path / file).unlink()
     path.write_text(text)  # whose only force it is
     assert rig(*facts, "--dyno") == 0
+    (strut,) = load_plan(tmp_path / "my.yaml").model.struts
+    assert strut.free_length_m == 0.36  # no weight rests on it
     plan = load_plan(tmp_path / "my.yaml")
     assert plan.config.prescribed_motion is not None
     assert not errors(plan)
