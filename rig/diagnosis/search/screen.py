@@ -461,10 +461,11 @@ def _evaluate_start(this: Round, at: StrutEffect, start: Array) -> _Start | None
     if not np.isfinite(power) or power <= 0.0:
         return None
     if effect(at[1]).scaled:
-        size = float(column @ this.residual) / power
-        values = scale_law(at[1], start, size)
-        cost = float(this.residual @ this.residual) - size**2 * power
-        return None if values is None else (cost, values)
+        match = float(column @ this.residual)
+        values = scale_law(at[1], start, match / power)
+        if values is None:
+            return None
+        return float(this.residual @ this.residual) - match * (match / power), values
     residual = this.residual - column
     return float(residual @ residual), start
 
