@@ -15,7 +15,7 @@ from rig.diagnosis.search.damper_with_friction import screen_damper_with_frictio
 from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool
 from rig.diagnosis.search.score_test import find_changes
-from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law
+from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law, rank_laws
 from tests.criteria_study.cases import Regressive
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.test_planted_effects import FrictionAndHardening, FrictionAndValves
@@ -142,3 +142,10 @@ def test_a_model_with_as_many_laws_as_may_be_is_not_added_to():
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
     for change in find_changes(pool.problem, fitted, pool.along, 1):
         assert len(change.laws) == 1
+
+
+def test_a_law_of_which_the_size_overflows_is_no_start():
+    pool = pool_of(little_dyno, Orifice())
+    stage = pool.linear_stage
+    huge = stage._replace(target=1e160 * stage.target, coarse=None)
+    assert rank_laws(huge, no_law(stage), 5, [(0, "quadratic_damping")]) == []
