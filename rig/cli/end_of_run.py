@@ -46,11 +46,11 @@ def print_end(
     """
     if as_json:
         typer.echo(_summary_text(ended), nl=False)
-        _refuse_bad_end(plan, ended)
+        _refuse_bad_end(plan, ended, folder)
         return
     print_run(ended, with_timing=with_timing)
     print_text(f"Run: {folder}")
-    _refuse_bad_end(plan, ended)
+    _refuse_bad_end(plan, ended, folder)
     if plan.has_force and (gaps := _gaps_of(ended, folder)) is not None:
         print_text(gaps.report(folder.name), "yellow")
     _print_stated_std(plan, ended, folder)
@@ -110,7 +110,22 @@ def _gaps_of(ended: "Ended", folder: Path) -> "Gaps | None":
     return None
 
 
-def _refuse_bad_end(plan: "Plan", ended: "Ended") -> None:
+def _describe_heights(plan: "Plan", folder: Path) -> str:
+    """What arrived of each height in a run that did not start, a line for each."""
+    from rig.log.reader import read_run
+    from rig.recordings.run_folder import read_channel
+    from rig.sensors.mounting import describe_arrivals
+
+    with contextlib.suppress(InputError):  # nothing was logged
+        run = read_run(folder)
+        return "".join(
+            f"\n{height.key}: {describe_arrivals(run, height, read_channel(run, height)[0])}"
+            for height in plan.heights
+        )
+    return ""
+
+
+def _refuse_bad_end(plan: "Plan", ended: "Ended", folder: Path) -> None:
     """Exit with a message where a run ended in its safe state, without a height or without a log.
 
     Raises:
@@ -120,11 +135,11 @@ def _refuse_bad_end(plan: "Plan", ended: "Ended") -> None:
 
     stderr = Console(stderr=True)
     if ended.state.mode is Mode.WAITING:
-        messages = sorted({entry.message for entry in plan.config.signals.height.values()})
         stderr.print(
-            f"No valid height arrived: expected frames of {', '.join(messages)}. Is the bench "
-            "sending, are channel, bit rate and DBC right, and which frames were refused?",
+            f"The model did not start: no valid height arrived.{_describe_heights(plan, folder)}",
             style="red",
+            highlight=False,
+            soft_wrap=True,
         )
         raise typer.Exit(FAILED)
     if ended.state.mode is Mode.SAFE:

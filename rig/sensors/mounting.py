@@ -113,12 +113,18 @@ def readings_of(run: Path, plan: Plan, name: str) -> Readings:
     log = read_run(run)
     t_s, values = read_channel(log, channel)
     if len(values) < _FEWEST:
-        raise InputError(f"{channel.key}: {_what_came(log, channel, len(values))}")
+        raise InputError(f"{channel.key}: {describe_arrivals(log, channel, t_s)}")
     return summarise(t_s, values)
 
 
-def _what_came(run: RunFolder, channel: Channel, valid: int) -> str:
-    """What arrived of a channel instead of its readings, and what to do."""
+def describe_arrivals(run: RunFolder, channel: Channel, valid_s: Array) -> str:
+    """What arrived of a channel that does not suffice, and what to do.
+
+    Args:
+        run: Of the folder.
+        channel: Of a height, or of another measured quantity.
+        valid_s: Times of its valid readings in the run, shape (n,).
+    """
     received = [frame for frame, direction in run.frames() if direction == "R"]
     if not received or channel.message is None:
         return (
@@ -132,10 +138,22 @@ def _what_came(run: RunFolder, channel: Channel, valid: int) -> str:
             f"{len(received)} frames arrived, but none of {message}: is the sensor powered, and is "
             "this its message?"
         )
+    if len(valid_s) < _FEWEST:
+        return (
+            f"{own} frames of {message} arrived, of which {len(valid_s)} hold a valid reading, "
+            f"expected at least {_FEWEST}: what does the sensor's valid signal report, and does "
+            "the DBC have its length and checksum?"
+        )
+    interval_s = float(np.median(np.diff(valid_s)))
+    cycle_s = (channel.message.cycle_time_ns or 0) * 1e-9
+    if 2.0 * interval_s < cycle_s:
+        return (
+            f"{message} arrives every {interval_s * 1e3:.3g} ms, and the DBC states a cycle of "
+            f"{cycle_s * 1e3:g} ms: correct its GenMsgCycleTime in the DBC"
+        )
     return (
-        f"{own} frames of {message} arrived, of which {valid} hold a valid reading, expected at "
-        f"least {_FEWEST}: what does the sensor's valid signal report, and does the DBC have its "
-        "length and checksum?"
+        f"{own} frames of {message} arrived, {len(valid_s)} with a valid reading: are there gaps "
+        "or bursts, or is another height or the applied force missing?"
     )
 
 

@@ -52,7 +52,7 @@ def test_each_has_a_process_and_a_folder_and_the_worst_exit_code_counts(two, tmp
     assert {item["mode"] for item in found.values()} == {"WAITING"}
     for name in ("left", "right"):
         assert yaml.safe_load((out / name / "run.yaml").read_text())["ending"]["ticks"] > 100
-        assert f"{name}: No valid height arrived" in said
+        assert f"{name}: The model did not start: no valid height arrived" in said
 
 
 @pytest.mark.long

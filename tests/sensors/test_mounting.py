@@ -1,6 +1,7 @@
 """Zero, direction and tare of sensors, measured at rest and written into the configuration."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from rig.channels.channel import MeasuredSignal, Zero
 from rig.cli.main import app
+from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.sensors.mounting import Readings, find_zero, summarise
+from rig.recordings.run_folder import read_channel
+from rig.sensors.mounting import Readings, describe_arrivals, find_zero, summarise
 from rig.simulated_bench.config import load_bench_config
 from tests.run.test_runs import lockstep
 
@@ -186,3 +189,15 @@ def test_what_arrived_instead_of_a_reading(tmp_path, runs):
     path.write_text(yaml.safe_dump(content))
     other = zero(path, "--length-m", 0.36, "--run", runs[0.36])
     assert "frames arrived, but none of BENCH_MEASUREMENT_2" in str(other.exception)
+
+
+def test_frames_that_come_more_often_than_the_dbc_states_are_named(tmp_path, runs):
+    (height,) = load_plan(config(tmp_path)).heights
+    run = read_run(runs[0.30])
+    valid_s, _ = read_channel(run, height)
+    every_ms = height.message.cycle_time_ns / 1e6
+    message = replace(height.message, cycle_time_ns=10 * height.message.cycle_time_ns)
+    text = describe_arrivals(run, replace(height, message=message), valid_s)
+    assert f"arrives every {every_ms:g} ms, and the DBC states a cycle of {10 * every_ms:g}" in text
+    assert "gaps or bursts" in describe_arrivals(run, height, valid_s)
+    assert "of which 3 hold a valid" in describe_arrivals(run, height, valid_s[:3])
