@@ -263,6 +263,18 @@ def test_a_gain_beside_another_spring_is_not_a_mass_and_a_damper():
     assert any("gain" in note for note in found.notes)
 
 
+def test_a_spring_and_a_damper_that_are_softer_are_no_gain_with_another_mass():
+    runs = [bench.run(Nothing()), bench.run(Nothing(), seed=2)]
+    given = bench.model(
+        mass=0.98 * bench.MASS, stiffness=1.05 * bench.STIFFNESS, damping=1.05 * bench.DAMPING
+    )
+    found = diagnose(given, runs[:1], runs[1:])
+    assert {c.parameter for c in found.diagnosis.linear} >= {"mass_kg", "stiffness_n_per_m"}
+    (body,) = found.corrected.skeleton.bodies
+    assert body.mass_kg == pytest.approx(bench.MASS, rel=2e-3)
+    assert found.corrected.struts[0].stiffness_n_per_m == pytest.approx(bench.STIFFNESS, rel=2e-3)
+
+
 class StopAndRipple(Nothing):
     def force(self, t, z, v, state):
         return 3.0 * Stop().force(t, z, v, state) + Ripple().force(t, z, v, state)

@@ -62,7 +62,7 @@ def select_model(
     progress("removing superfluous laws", 0.85)
     most_laws = pool.criteria.most_laws
     while True:
-        chosen = _without_superfluous_laws(pool, pool.chosen(most_laws))
+        chosen = _without_superfluous_laws(pool, pool.chosen(most_laws), progress)
         final, alike = _with_few_corrections(pool, chosen)
         why = find_unidentifiable_law(pool.problem, final.fit) if final.size else None
         if why is None:
@@ -86,13 +86,15 @@ def select_model(
 # --- superfluous laws -------------------------------------------------------------------------
 
 
-def _without_superfluous_laws(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
+def _without_superfluous_laws(
+    pool: Pool, chosen: ValidatedModel, progress: Progress
+) -> ValidatedModel:
     """The model with each law removed, or replaced by a simpler one, where that loses nothing."""
     while True:
         simpler = (
             other
             for law in chosen.fit.candidate.new
-            for other in _simpler_models(pool, chosen, law)
+            for other in _simpler_models(pool, chosen, law, progress)
             if not pool.prefers(chosen, other)
         )
         other = next(simpler, None)
@@ -102,7 +104,7 @@ def _without_superfluous_laws(pool: Pool, chosen: ValidatedModel) -> ValidatedMo
 
 
 def _simpler_models(
-    pool: Pool, chosen: ValidatedModel, law: StrutEffect
+    pool: Pool, chosen: ValidatedModel, law: StrutEffect, progress: Progress
 ) -> Iterable[ValidatedModel]:
     """Models without a law of a chosen one, or with a simpler one for it; fitted on demand."""
     stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
@@ -114,6 +116,7 @@ def _simpler_models(
         return screening is not None and screening.validation_cost <= most()
 
     if chosen.size > 1:
+        progress(f"fitting without {law[1]}", 0.85)
         # Its first fit may have ended in a side valley, which the larger model has left.
         is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
         is_fitted |= less in pool.converged and less in pool.invalid
@@ -127,6 +130,7 @@ def _simpler_models(
         if effect(name).linear or other in less.new:
             continue
         candidate = less.with_effects(other)
+        progress(f"fitting {name} instead of {law[1]}", 0.85)
         if candidate not in pool.fits:
             for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
                 if screening.values and is_promising(screening):
@@ -232,6 +236,8 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> tuple[Validated
     if gain is None:
         return result, False
     linear, free = gain
+    if _contradicts_prior(problem, result.fit.parts.linear, linear, pool.criteria.significant):
+        return result, False
     first = CandidateModel(chosen.fit.candidate, result.fit.parts._replace(linear=linear))
     refitted = fit(problem, first, free)
     if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
@@ -316,6 +322,16 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
             changes[i] = (whole + changes[i]) / (1.0 + share) - whole
             free[i] |= p.kind == "preload"
     return changes, free
+
+
+def _contradicts_prior(problem: Problem, before: Array, after: Array, significant: float) -> bool:
+    """Whether other corrections are farther from the model's tolerances: of a mass, or all."""
+    deviations = np.array([p.deviation for p in problem.linear])
+    masses = [p.kind == "mass" for p in problem.linear]
+    if np.any(np.abs(after[masses]) > np.abs(before[masses])):
+        return True
+    farther = np.sum((after / deviations) ** 2) - np.sum((before / deviations) ** 2)
+    return bool(farther > significant**2)
 
 
 # --- rejected laws ----------------------------------------------------------------------------
