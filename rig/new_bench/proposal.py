@@ -13,6 +13,7 @@ from enum import Enum
 from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal, alive_counter
 from can_dbc.errors import DatabaseError, InputError, expected_name
+from can_dbc.units import Dimension
 from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
 from rig.bus.bus import WITHOUT_BIT_RATE, BusConfig
 from rig.channels.measured_quantities import (
@@ -164,11 +165,13 @@ def find_height(database: Database, named: str | None) -> Choice:
     if not ranked[0].is_likely:
         lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
         more = ", ..." if len(ranked) > _MOST_OTHERS else ""
-        counts = signal_ranking.counts(messages)[:_MOST_OTHERS]
+        counts = [full_name(*item) for item in signal_ranking.counts(messages)]
+        unknown = (
+            f"; {' or '.join(counts[:_MOST_OTHERS])} has no unit that is known" if counts else ""
+        )
         raise InputError(
             f"{database.path}: no length looks like the height of a strut (there are {lengths}"
-            f"{more}): name it with --height MESSAGE.SIGNAL"
-            + "".join(f". If it is {full_name(*item)}: {_ask_for_unit(*item)}" for item in counts)
+            f"{more}{unknown}): name it with --height MESSAGE.SIGNAL"
         )
     return _choice(HEIGHT, ranked[0], ranked)
 
@@ -183,7 +186,8 @@ def find_force(database: Database, force: Force, named: str | None) -> Choice | 
     ranked = rank_signals(database.messages.values(), likeness)
     if named is not None:
         return _named(database, force.quantity, named, ranked, force.option)
-    likely = [item for item in ranked if item.is_likely]
+    estimates = _estimates(database)
+    likely = [item for item in ranked if item.is_likely and item.name not in estimates]
     return _choice(force.quantity, likely[0], likely) if likely else None
 
 
@@ -193,8 +197,7 @@ def unclear_forces(database: Database, taken: Iterable[Choice]) -> list[RankedSi
     A force that another node could take from the bridge is none of them.
     """
     messages = list(database.messages.values())
-    names = {choice.name for choice in taken}
-    names |= {it.name for it in rank_signals(messages, signal_ranking.ESTIMATE) if it.is_likely}
+    names = {choice.name for choice in taken} | _estimates(database)
     ranked = [
         sorted(rank_signals(messages, kind), key=lambda item: item.name)
         for kind in (signal_ranking.APPLIED_FORCE, signal_ranking.STRUT_FORCE)
@@ -209,6 +212,12 @@ def unclear_forces(database: Database, taken: Iterable[Choice]) -> list[RankedSi
         and ((item.score > _ELSEWHERE and not item.is_likely) or item.name in suits_both)
     ]
     return sorted(free, key=lambda item: -item.score)
+
+
+def _estimates(database: Database) -> set[str]:
+    """Forces that are likely to be an estimate, which nothing measures."""
+    ranked = rank_signals(database.messages.values(), signal_ranking.ESTIMATE)
+    return {item.name for item in ranked if item.is_likely}
 
 
 def find_temperature(database: Database, sender: str | None) -> Choice | None:
@@ -238,8 +247,13 @@ def _named(
     if not measures(signal, quantity.dimension):
         names = [item.name for item in ranked]
         unit = f"has the unit {signal.unit!r}" if signal.unit else "has no unit"
-        if quantity is HEIGHT and signal_ranking.is_count(signal):
-            raise InputError(f"{option} {name}: {unit}: {_ask_for_unit(message, signal)}")
+        if signal_ranking.is_count(signal):
+            line = _line_with_unit(signal, quantity.dimension)
+            raise InputError(
+                f"{option} {name}: {unit}, expected one of {quantity.dimension.name.lower()}: "
+                f"state scale and unit in a copy of the DBC, in {message.name}: {line} and the "
+                "receivers as before"
+            )
         raise InputError(
             f"{option} {name}: {unit}, expected one of {quantity.dimension.name.lower()}"
             + (f": {expected_name(name, names)}" if names else "")
@@ -247,13 +261,13 @@ def _named(
     return Choice(quantity, message, signal, "as named", ())
 
 
-def _ask_for_unit(message: Message, signal: Signal) -> str:
-    """What to write into the DBC for a position that is counted."""
+def _line_with_unit(signal: Signal, dimension: Dimension) -> str:
+    """What to write into the DBC for a signal whose unit is not known."""
     kind = f"{'0' if signal.is_big_endian else '1'}{'-' if signal.is_signed else '+'}"
+    unit = "mm" if dimension is Dimension.LENGTH else dimension.value
     return (
-        f"state in {message.name}, in a copy of the DBC, how long a count is. For counts of 0.01 "
-        f"mm: `SG_ {signal.name} : {signal.start}|{signal.length_bits}@{kind} (0.01,0) [0|0] "
-        '"mm"`, then its receivers as before'
+        f"`SG_ {signal.name} : {signal.start}|{signal.length_bits}@{kind} (SCALE,0) [0|0] "
+        f'"{unit}"`, with SCALE in {unit} per count'
     )
 
 
@@ -409,8 +423,9 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
         return _lines_of_own_message(database)
     best = estimates[0]
     lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
-    # Where the validity has a message of its own, it is one of the same sender.
-    near = [best.message, *(item for item in free if item is not best.message)]
+    # Validity and mode may have another message, but never one that another node sends.
+    sender = best.message.sender
+    near = [best.message, *(it for it in free if it is not best.message and it.sender == sender)]
     valid = _find_integer(near, _VALID_WORDS, lambda bits: bits >= 1)
     lines += (
         [f"  {VALID.key}: {{message: {valid[0].name}, signal: {valid[1].name}}}"]

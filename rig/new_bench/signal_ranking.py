@@ -96,12 +96,13 @@ HEIGHT = Likeness(
         "einfederung federbein ridehgt rideheight ride wire potentiometer pot jounce",
         plus_2="height hght hoehe travel displacement displ stringpot weg wegsensor level niveau",
         plus_1="pos position length laenge hub spring feder corner axle achse encoder enc",
-        minus_4="odo odometer distance dist trip range reichweite altitude gps latitude longitude "
+        minus_2="distance dist",
+        minus_4="odo odometer trip range reichweite altitude gps latitude longitude "
         "lane radar object obj target curve kurve snow rain urea fuel tank tire tyre circumference "
         "throttle brake pedal clutch steer steering rack valve camera cam parking obstacle "
         "pedestrian waypoint path route road gap lateral wheelbase track trk vehicle ahead "
         "mileage km seat injector crank oil oel attitude cloud visibility width potential",
-        minus_2="offset setpoint soll cmd command request req nominal target demand raw prev "
+        minus_2_0="offset setpoint soll cmd command request req nominal target demand raw prev "
         "model estimated simulated",
     ),
     spans=((0.005, 2.0), (0.0, 20.0)),

@@ -211,7 +211,7 @@ def _zero(plan: Plan, height: Channel) -> Finding:
             return Finding(Severity.WARNING, what, text)
         return Finding(Severity.OK, what, text + (", reversed" if entry.reversed else ""))
     if _message(height).signal(height.signal).offset:
-        return Finding(Severity.OK, what, "that of the DBC")
+        return Finding(Severity.OK, what, f"the offset in the DBC; {measure} compares it")
     text = "none was set: what the sensor reads counts as the strut's length; expected zero: "
     text += f"{{reads, at_m}}, which {measure} measures, at any length that is known"
     return Finding(Severity.WARNING, what, text)

@@ -104,11 +104,17 @@ def test_a_dbc_without_a_height_is_answered_by_what_to_do(dbc):
         find_height(load_database(write(dbc, {"ShockPot": '(1,0) [0|0] ""'})), None)
     increments = {"Odometer": '(0.001,0) [0|65] "km"', "Pos": '(1,0) [0|0] "inc"'}
     database = load_database(write(dbc, increments))
-    with pytest.raises(InputError, match=r"it is M2\.Pos: state in M2, in a copy of the DBC"):
+    with pytest.raises(InputError, match=r"; M2\.Pos has no unit that is known\): name it with"):
         find_height(database, None)
-    # As the message says.
-    with pytest.raises(InputError, match=r"`SG_ Pos : 0\|16@1- \(0\.01,0\) \[0\|0\] \"mm\"`"):
+    with pytest.raises(
+        InputError,
+        match=r"M2\.Pos: has the unit 'inc', .* in a copy of the DBC, in M2: "
+        r"`SG_ Pos : 0\|16@1- \(SCALE,0\) \[0\|0\] \"mm\"`, with SCALE in mm per count",
+    ):
         find_height(database, "M2.Pos")
+    database = load_database(write(dbc, {"ShockPot": MM, "F": '(1,0) [0|0] "10N"'}))
+    with pytest.raises(InputError, match=r"`SG_ F : 0\|16@1- .* in N per count"):
+        find_force(database, Force.APPLIED, "M2.F")
     database = load_database(write(dbc, {"ShockPot": MM, "Force": '(1,0) [0|0] "N"'}))
     assert find_height(database, "M1.ShockPot").why == "as named"
     with pytest.raises(InputError, match=r"--height M2\.Force: has the unit 'N', .* of length"):
@@ -247,3 +253,17 @@ def test_validity_and_counter_of_the_heights_message_are_used(flag, values, valu
 )
 def test_words_of_a_name(name, words):
     assert list(split_name(name)) == words
+
+
+def test_an_estimate_is_published_and_not_taken_as_a_load_cell(dbc):
+    dbc.write_text(DBC.replace(" SG_ EstimatedForce : 7|16@0-", " SG_ EST_StrutForce : 7|16@0-"))
+    assert find_force(load_database(dbc), Force.IN_STRUT, None) is None
+    published = yaml.safe_load(propose(dbc))["publish"]
+    assert published == {"force": {"message": "CONTROL_1", "signal": "EST_StrutForce"}}
+
+
+def test_the_mode_is_not_published_in_a_message_of_another_node(dbc):
+    other = 'BO_ 500 SERVICE: 8 PLC\n SG_ RigState : 0|4@1+ (1,0) [0|15] "" SENSOR\n\nBA_DEF_ BO_'
+    text = DBC.replace("BU_: SENSOR CONTROL", "BU_: SENSOR CONTROL PLC")
+    dbc.write_text(text.replace("BA_DEF_ BO_", other, 1))
+    assert "status" not in yaml.safe_load(propose(dbc))

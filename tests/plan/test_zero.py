@@ -90,7 +90,7 @@ def limits_of_strut(folder, more):
             Severity.WARNING,
             "not known whether the sensor is reversed: expected rig zero .*my.yaml --length",
         ),
-        ({}, AS_IS.replace(",0)", ",0.2)"), Severity.OK, "that of the DBC"),
+        ({}, AS_IS.replace(",0)", ",0.2)"), Severity.OK, "offset in the DBC; rig zero"),
     ],
 )
 def test_a_height_without_a_zero_is_a_warning(tmp_path, given, dbc, severity, text):
