@@ -61,12 +61,16 @@ def diagnose(
     print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
         print_text(f"Printed: {out}/report.pdf")
+    if result.diagnosis.verdict == "not_explained":
+        print_text(f"No law explains what {model} lacks: continue with {model}.")
+        return
     if result.diagnosis.verdict == "partly_explained":
         others = "".join(f" --held-out {path}" for path in held_out or [])
-        left_n = result.diagnosis.held_out.residual_force_rmse_n.after
+        force, floor = result.diagnosis.held_out.residual_force_rmse_n, result.diagnosis.noise_floor
         print_text(
-            f"The corrected model still lacks {left_n:.3g} N RMS. If that matters for your use, "
-            "diagnose once more what it lacks: `rig diagnose "
+            f"The corrected model still lacks {force.after:.3g} N RMS of {force.before:.3g} N "
+            f"(noise alone: {floor.residual_force_rmse_n:.2g} N). Only if that is too much for "
+            "your use, diagnose what it lacks, which takes longer: `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )
     is_driven = result.diagnosis.held_out.strut_force_rmse_n is None

@@ -71,8 +71,8 @@ LengthAtRest = Annotated[
         metavar="M",
         min=1e-3,
         max=100.0,
-        help="Length of the strut at rest, in m: under the weight of the mass, without an "
-        "applied force; with --dyno without a force.",
+        help="Length of the strut at rest, in m. Without --free-length-m, the free length follows "
+        "from it: under the weight alone (without an applied force), with --dyno without a force.",
     ),
 ]
 FreeLength = Annotated[
