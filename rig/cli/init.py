@@ -222,6 +222,7 @@ def _find_signals(
         find_height,
         find_temperature,
         unclear_forces,
+        unknown_units,
     )
 
     found = find_height(database, height)
@@ -255,7 +256,8 @@ def _find_signals(
     if is_dyno and not any(choice.quantity is Force.IN_STRUT.quantity for choice in chosen):
         raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
     temperature = find_temperature(database, found.message.sender)
-    return Signals(found, chosen, temperature, tuple(unclear))
+    unknown = tuple(name for name in unknown_units(database) if name != found.name)
+    return Signals(found, chosen, temperature, tuple(unclear), unknown)
 
 
 def _ask_place(name: str) -> "Force | None":
@@ -363,6 +365,8 @@ def _print(
             f"files and add --applied-force {item.name} for a force on the body, or --load-cell "
             f"{item.name} for one in the strut"
         )
+    for item in signals.unknown:
+        print_text(f"Not considered: {item}, whose unit is not understood")
     for what, why in database.passed_over.items():
         print_text(f"Passed over in {database.path.name}: {what}: {why}")
     print_text(

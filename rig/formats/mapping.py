@@ -33,7 +33,8 @@ class TextLayout(_Section):
         encoding: Character encoding, by its name in Python.
         skip_lines: Lines before the header line, or before the data if there is none.
         column_names: Whether the file has a header line with the names of the columns.
-        skip_after_names: Lines between the header line and the data, such as a line with units.
+        skip_after_names: Lines between the header line and the data, such as a line with units;
+            blank lines do not count.
         first_row: First row of data that is used, counted from 0.
         rows: Number of rows that are used; all if absent.
     """

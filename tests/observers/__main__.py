@@ -268,10 +268,11 @@ def moving_table(seeds):
 
 TEXT = """
 The force error is the RMS difference between the estimated force and that of the simulated bench.
-Four estimates are compared: the PI observer with the published gains, a PI observer and a
-noise-aware observer that are tuned as by `rig tune`, and the force smoothed after the run. An
-observer is tuned on one run and evaluated on runs with other noise; in the tables of latency and of
-a bridge that joins a moving bench, the gains are fixed.
+Four estimates are compared: the PI observer with the published gains (those of the
+[reference case](../explanation/method.md#the-reference-case)), a PI observer and a noise-aware
+observer that are tuned as by `rig tune`, and the force smoothed after the run. An observer is tuned
+on one run and evaluated on runs with other noise; in the tables of latency and of a bridge that
+joins a moving bench, the gains are fixed.
 
 The runs over CAN use the shipped reference case. The benches of the grid have other masses and
 natural frequencies, a spring that hardens and a damper with a knee; their linear model has three

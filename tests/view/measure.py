@@ -158,8 +158,8 @@ def conclusion(pairs, seconds):
     if min(differences) > 0:
         return f"{found} In every pair, more ticks are missed with a page."
     return (
-        f"{found} The sign changes from pair to pair: {len(pairs)} pairs of {seconds} s do not "
-        "show a cost of the page."
+        f"{found} Not every pair has more missed ticks with a page: {len(pairs)} pairs of "
+        f"{seconds} s do not show a cost of the page."
     )
 
 
