@@ -124,12 +124,14 @@ class Signals:
 
     Attributes:
         unclear: Forces of which nothing says whether they act on the body or in the strut.
+        unknown: Names of signals whose unit is not understood.
     """
 
     height: Choice
     forces: tuple[Choice, ...]
     temperature: Choice | None
     unclear: tuple[RankedSignal, ...] = ()
+    unknown: tuple[str, ...] = ()
 
     @property
     def choices(self) -> tuple[Choice, ...]:
@@ -165,15 +167,18 @@ def find_height(database: Database, named: str | None) -> Choice:
     if not ranked[0].is_likely:
         lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
         more = ", ..." if len(ranked) > _MOST_OTHERS else ""
-        counts = [full_name(*item) for item in signal_ranking.counts(messages)]
-        unknown = (
-            f"; {' or '.join(counts[:_MOST_OTHERS])} has no unit that is known" if counts else ""
-        )
+        counts = unknown_units(database)[:_MOST_OTHERS]
+        unknown = f"; {' or '.join(counts)} has no unit that is known" if counts else ""
         raise InputError(
             f"{database.path}: no length looks like the height of a strut (there are {lengths}"
             f"{more}{unknown}): name it with --height MESSAGE.SIGNAL"
         )
     return _choice(HEIGHT, ranked[0], ranked)
+
+
+def unknown_units(database: Database) -> list[str]:
+    """Names of signals that could be a height or a force, but for their unit."""
+    return [full_name(*item) for item in signal_ranking.counts(database.messages.values())]
 
 
 def find_force(database: Database, force: Force, named: str | None) -> Choice | None:
@@ -518,8 +523,9 @@ def _supervision(signals: Signals) -> list[str]:
     lines += [
         "    # An estimate that is less certain than you accept: largest standard deviation, N.",
         "    # - {value: force_std_n, high: 100, action: hold}",
-        "    # The travel of the strut; without it, the range of the signal is the limit.",
-        "    # - {value: height_m, low: 0.1, high: 0.5, action: safe}",
+        "    # The travel of the strut, as measured (height_m would be the model's height, which",
+        "    # goes beyond that of the bench until the observer is tuned).",
+        "    # - {value: measured_height_m, low: 0.1, high: 0.5, action: safe}",
     ]
     if signals.measures(Force.APPLIED):
         lines += [

@@ -403,9 +403,11 @@ def _limits(plan: Plan) -> list[Finding]:
         findings.append(Finding(Severity.WARNING, "limits of frozen sensors", text))
     for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
         text = _describe_rows(rows) or "none"
-        wide = any(map(_limits_no_strut, rows))
+        is_travel_limited = any(row.value is LimitedValue.MEASURED_HEIGHT_M for row in rows)
+        wide = not is_travel_limited and any(map(_limits_no_strut, rows))
         if wide:
-            text += f"; height_m limits no strut: expected the travel of {name}"
+            text += "; height_m limits no strut: expected a limit on measured_height_m, with the "
+            text += f"travel of {name}"
         severity = Severity.WARNING if wide or not rows else Severity.OK
         findings.append(Finding(severity, f"limits of {name}", text))
     for channel, rows in zip(plan.channels, plan.limits.channels, strict=True):

@@ -165,3 +165,11 @@ def test_what_a_dbc_holds_that_cannot_be_read_is_listed(rig, tmp_path, capsys):
     assert rig(*FACTS) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "Passed over in my.dbc: message OTHER: The signals" in shown
+
+
+def test_signals_in_units_that_are_not_understood_are_listed(rig, tmp_path, capsys):
+    path = tmp_path / "my.dbc"
+    path.write_text(path.read_text().replace('(0.1,0) [0|0] "daN"', '(1,0) [0|0] "10N"'))
+    assert rig(*FACTS) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "Not considered: CELL.Force, whose unit is not understood" in shown
