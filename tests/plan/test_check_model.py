@@ -63,4 +63,7 @@ def test_a_height_limit_that_is_wider_than_any_travel_is_a_warning(tmp_path):
     row = {"value": "height_m", "low": -183.0, "high": 18.0, "action": "safe"}
     found = findings(tmp_path, supervision={"limits": [row]})["limits of strut"]
     assert found.severity is Severity.WARNING
-    assert "expected the travel of strut" in found.text
+    assert "expected a limit on measured_height_m" in found.text
+    travel = {"value": "measured_height_m", "low": 0.3, "high": 0.5, "action": "safe"}
+    found = findings(tmp_path, supervision={"limits": [row, travel]})["limits of strut"]
+    assert found.severity is Severity.OK
