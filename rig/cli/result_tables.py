@@ -25,6 +25,16 @@ _OF_RUN = {
 """Counts in the table of a run, apart from refused frames and missed ticks, with their labels."""
 
 
+_MEANING = {
+    "untimed": ": sample time not known",
+    "no_value": ": the sensor states no value",
+    "implausible": ": beyond a limit",
+    "masquerade": ": CRC of another message",
+    "second_sender": ": from another sender",
+}
+"""Causes of refusals whose names do not say it."""
+
+
 def print_case(case: "Case") -> None:
     """Print the deviation of the model from the bench for each strut."""
     for strut in case.struts:
@@ -115,7 +125,10 @@ def print_run(ended: "Ended", *, with_timing: bool) -> None:
     missed = f"{counts.overruns}"
     if counts.overruns:
         missed += f" ({100.0 * counts.overruns / (ended.ticks + counts.overruns):.2g} %)"
-    refused = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in counts.refusals.items())
+    refused = "; ".join(
+        f"{name.replace('_', ' ')} {n}{_MEANING.get(name, '')}"
+        for name, n in counts.refusals.items()
+    )
     rows: list[tuple[str, str | Text]] = [
         ("time in each mode", _modes(ended)),
         ("ticks missed", missed),
