@@ -127,9 +127,10 @@ def describe_arrivals(run: RunFolder, channel: Channel, valid_s: Array) -> str:
     """
     received = [frame for frame, direction in run.frames() if direction == "R"]
     if not received or channel.message is None:
+        expected = "some" if channel.message is None else f"frames of {channel.message.name}"
         return (
-            "no frames arrived at all, expected some: is the bench sending, and are interface, "
-            "channel and bit rate those of its bus?"
+            f"no frames arrived at all, expected {expected}: is the bench sending, and are "
+            "interface, channel and bit rate those of its bus?"
         )
     message, directory = channel.message.name, Directory([channel.message])
     own = sum(directory.index_of(f.arbitration_id, f.is_extended) is not None for f in received)
