@@ -218,12 +218,17 @@ def load_mapping(path: Path) -> TableMapping:
 
 
 class OutputColumn(NamedTuple):
-    """A column of the CSV that is written: `factor * reading + offset`."""
+    """A column of the CSV that is written: `factor * reading + offset`.
+
+    Attributes:
+        unit: Unit of the reading, or with a gain that of gain times reading.
+    """
 
     name: str
     key: str
     column: ColumnName
     unit: str
+    has_gain: bool
     factor: float
     offset: float
     words: str
@@ -257,10 +262,11 @@ def _output_column(name: str, channel: _Channel, dimension: Dimension) -> Output
     offset = calibration.apply(conversion.offset)
     if offset:
         words += f" {'+' if offset > 0 else '-'} {abs(offset):.9g}"
-    gain = "" if channel.gain == 1.0 else f", {channel.gain:g} {channel.unit} a reading"
+    has_gain = channel.gain != 1.0
+    gain = f", {channel.gain:g} {channel.unit} a reading" if has_gain else ""
     reversed_ = ", sign reversed" if calibration.is_reversed else ""
     words += f" (read in {channel.unit}{gain}{reversed_})"
-    return OutputColumn(name, key, channel.column, channel.unit, factor, offset, words)
+    return OutputColumn(name, key, channel.column, channel.unit, has_gain, factor, offset, words)
 
 
 def unit_conversion(unit: str, dimension: Dimension, key: str) -> SiConversion:

@@ -63,7 +63,7 @@ def _read_channel(source: Path, file: Any, output: OutputColumn) -> tuple[Array,
     t_s = np.array(signal.timestamps, dtype=np.float64)
     if len(values) < 2 or values.ndim != 1 or not np.all(np.isfinite(values)):
         raise InputError(f"{source}: channel {name!r}: expected two or more numbers")
-    if signal.unit and signal.unit != output.unit:
+    if not output.has_gain and signal.unit and signal.unit != output.unit:
         raise InputError(
             f"{source}: {output.key}.unit = {output.unit!r}, but the file has {signal.unit!r}"
         )

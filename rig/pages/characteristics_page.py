@@ -71,7 +71,7 @@ def _badge(
 
 
 def _draw(records: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]]) -> str:
-    """Peak force over peak velocity, force over velocity and force over displacement."""
+    """Force at peak velocity over peak velocity, force over velocity and force over displacement."""
     style = {
         "axes.grid": True,
         "grid.alpha": 0.3,
@@ -93,7 +93,7 @@ def _draw(records: Sequence[Characteristics], points: Sequence[Sequence[PointVer
         for axes in (peaks, velocities):
             axes.locator_params(axis="x", nbins=6)
         peaks.set(
-            title="Peak force over peak velocity (PVP)",
+            title="Force at peak velocity over peak velocity (PVP)",
             xlabel="peak velocity / (m/s)",
             ylabel="force / N     ← rebound · compression →",
         )

@@ -338,8 +338,8 @@ class Temperature(_Section):
     Attributes:
         initial_c: Temperature at the start in degrees Celsius.
         ambient_c: Temperature of the air in degrees Celsius.
-        heat_capacity_j_per_k: Heat capacity of the damper in J/K; if absent, the dissipated power
-            does not heat the damper.
+        heat_capacity_j_per_k: Heat capacity of all dampers together in J/K; if absent, the
+            dissipated power does not heat them.
         cooling_time_s: Time constant of cooling in s; if absent, the damper does not cool.
     """
 
@@ -497,7 +497,7 @@ class BenchConfig(_Section):
         temperature: Temperature, common to all dampers: the power that their damper curves
             dissipate heats them, and the air cools them.
         undeclared_effects: Effects of the bench that the bridge's model does not contain.
-        transmissions: Messages that the bench sends.
+        transmissions: Messages that the bench sends; `rig bench` requires at least one.
         seed: Seed of the random numbers for noise, jitter and loss.
         step_ns: Longest step of the integrator in ns.
     """

@@ -161,3 +161,10 @@ def test_channels_of_an_mf4_file_become_csv(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="the file has 'mm'"):
         import_table(path, load_mapping(mapping_path), tmp_path / "out2.csv")
+    # With a gain the reading has the file's unit, such as V.
+    mapping_path.write_text(
+        "height: {column: Weg, unit: m, gain: 0.002}\nstrut_force: {column: Kraft, unit: kN}\n"
+    )
+    report = import_table(path, load_mapping(mapping_path), tmp_path / "out2.csv")
+    made = np.loadtxt(report.out, delimiter=",", skiprows=1)
+    np.testing.assert_allclose(made[:, 1], 0.02 * t_s, atol=1e-9)
