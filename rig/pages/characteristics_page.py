@@ -71,7 +71,7 @@ def _badge(
 
 
 def _draw(records: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]]) -> str:
-    """Force at peak velocity over peak velocity, force over velocity and force over displacement."""
+    """Force at peak velocity over peak velocity, force over velocity and over displacement."""
     style = {
         "axes.grid": True,
         "grid.alpha": 0.3,
