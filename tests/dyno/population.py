@@ -205,7 +205,8 @@ named correctly if the kind of fault is right; the direction in the name (compre
 both) is not compared. The last column covers only these dampers: it counts those whose 95 %
 interval contains the true size of the fault. It is empty where there is no single true size: the
 compliance of the simulated aerated oil depends on the force, and a changed damping has slightly
-different changes below and above the knee, because both scatter independently. """
+different changes below and above the knee, because both scatter independently.
+"""
 
 PLANTED = {
     "good": "none (good damper)",
