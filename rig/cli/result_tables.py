@@ -82,7 +82,8 @@ def _print_linear(diagnosis: "Diagnosis", *, struts: int) -> None:
             (f"{name} ({strut})" if struts > 1 else name, *cells)
             for name, _, strut, *cells in linear(diagnosis)
         ]
-        print_table(heads, rows, "Linear part")
+        title = "Linear part" + ", to which the effects add" * bool(diagnosis.effects)
+        print_table(heads, rows, title)
 
 
 def _print_effects(diagnosis: "Diagnosis") -> None:

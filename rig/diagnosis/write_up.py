@@ -58,6 +58,9 @@ run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integ
 _HOLD = 0.3
 """Share of half a sampling interval within which a delay may be that of a zero-order hold."""
 
+_FAR = 3.0
+"""Standard deviations from a stated value that one in 370 corrections exceeds by chance."""
+
 _FRICTION_LIKE = 0.2
 """Share of a damper law's RMS that differs from dry friction, below which it acts as that."""
 
@@ -372,6 +375,7 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "In these data a gain of the applied force is indistinguishable from a change of mass, "
             "stiffness and damping in one proportion. Weigh the mass to separate the two."
         )
+    notes += _notes_of_tolerances(problem, search.chosen.fit)
     if _resembles_hold(problem, search.chosen.fit):
         notes.append(
             "The delay is half a sampling interval, which a zero-order hold of the applied force "
@@ -383,6 +387,21 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "the initial states are those of the fit."
         )
     return tuple(notes)
+
+
+def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
+    """Corrections that are far beyond what the model file states of its accuracy."""
+    notes: list[str] = []
+    stated = problem.spec.tolerance
+    for parameter, change in zip(problem.linear, result.parts.linear, strict=True):
+        times = abs(float(change)) / parameter.deviation
+        if times > _FAR and getattr(stated, PARAMETERS[parameter.kind], None) is not None:
+            notes.append(
+                f"The correction of {PARAMETERS[parameter.kind]} is {times:.2g} times the standard "
+                "deviation that the model file states: is its value right, and do the effects "
+                "describe the strut?"
+            )
+    return notes
 
 
 def _notes_of_friction_like_laws(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dart_model.effects import CATALOGUE
+from dart_model.spec import ModelTolerance
 from rig.diagnosis.diagnose import diagnose
 from rig.recordings.recording import Recording
 from tests.diagnosis import little_bench as bench
@@ -326,3 +327,17 @@ def test_missing_samples_and_uneven_times_change_nothing():
     found = diagnose(bench.model(), [thinned], [record]).diagnosis
     assert [e.family for e in found.effects] == ["stiffness"]
     assert found.effects[0].parameters["stiffness_n_per_m"].value == pytest.approx(200.0, rel=0.01)
+
+
+def test_a_correction_beyond_the_stated_tolerance_is_noted():
+    runs = [bench.run(Nothing()), bench.run(Nothing(), seed=2)]
+    given = bench.model(stiffness=1.05 * bench.STIFFNESS)
+    for share, is_noted in ((1.0, True), (5.0, False)):
+        tolerance = ModelTolerance(stiffness_n_per_m=f"{share} %")
+        stated = given.model_copy(update={"tolerance": tolerance})
+        (note,) = [
+            note
+            for note in diagnose(stated, runs[:1], runs[1:]).diagnosis.notes
+            if "stiffness_n_per_m is" in note
+        ] or [""]
+        assert ("times the standard deviation" in note) is is_noted
