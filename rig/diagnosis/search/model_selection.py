@@ -325,8 +325,14 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
 
 
 def _contradicts_prior(problem: Problem, before: Array, after: Array, significant: float) -> bool:
-    """Whether other corrections are farther from the model's tolerances: of a mass, or all."""
-    deviations = np.array([p.deviation for p in problem.linear])
+        """Whether corrections are farther from the model's tolerances: of a mass, or all together.
+
+    The gain counts if the model file states its tolerance: it replaces several corrections.
+    """
+    stated = problem.spec.tolerance
+    is_gain_known = stated is not None and stated.input_gain is not None
+    counts = [p.kind != "gain" or is_gain_known for p in problem.linear]
+    deviations = np.where(counts, [p.deviation for p in problem.linear], np.inf)
     masses = [p.kind == "mass" for p in problem.linear]
     if np.any(np.abs(after[masses]) > np.abs(before[masses])):
         return True
