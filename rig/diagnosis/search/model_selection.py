@@ -325,7 +325,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
 
 
 def _contradicts_prior(problem: Problem, before: Array, after: Array, significant: float) -> bool:
-        """Whether corrections are farther from the model's tolerances: of a mass, or all together.
+    """Whether corrections are farther from the model's tolerances: of a mass, or all together.
 
     The gain counts if the model file states its tolerance: it replaces several corrections.
     """
