@@ -20,6 +20,10 @@ from dart_model.spec import ModelSpec, StrutSpec
 _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 """How far from the free length, and how fast, effects are sampled for their steepest slope."""
 
+_LARGEST_N = 1e6
+"""Force beyond which heights are not sampled: an exponential spring gives any force half a metre
+from its free length, and no bench reaches a meganewton."""
+
 
 class _Part(NamedTuple):
     """A part of a strut's force: of an effect, or of an FMU.
@@ -137,6 +141,9 @@ class Strut:
             ) from error
         # An FMU may refuse what lies outside its range.
         slopes = np.abs(np.diff(by_height) / np.diff(heights))
+        is_reached = np.maximum(np.abs(by_height[1:]), np.abs(by_height[:-1])) <= _LARGEST_N
+        if np.any(is_reached & np.isfinite(slopes)):
+            slopes[~is_reached] = np.nan
         rates = np.abs(np.diff(by_velocity) / np.diff(velocities))
         if not (np.any(np.isfinite(slopes)) and np.any(np.isfinite(rates))):
             raise ModelError(f"strut {self.name}: gives no force about its free length")

@@ -131,6 +131,20 @@ def test_a_stiff_law_shortens_the_step():
     assert state.positions[0] == pytest.approx(0.5, abs=3e-6)
 
 
+def test_a_force_that_no_bench_reaches_does_not_shorten_the_step():
+    # Half a metre from its free length this spring would give 1e24 N, and 1 µs was too long.
+    rubber = with_effect("exponential_stiffness", force_n=50.0, length_m=0.01)
+    assert rubber.step_s > 5e-5
+    state = rubber.init([0.5], [-3.0])  # thrown against it: 45 J
+    lowest_m = 0.5
+    for _ in range(1000):
+        state = rubber.step(rubber.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        lowest_m = min(lowest_m, state.positions[0])
+        assert math.isfinite(state.positions[0])
+    assert 0.4 < lowest_m < 0.47
+    assert abs(state.velocities[0]) < 3.0
+
+
 def test_parameters_that_give_no_force_are_refused():
     names = [item.name for item in CATALOGUE["restoring_surface"].parameters]
     with pytest.raises(InputError, match="strut strut: effects restoring_surface: no force with"):
