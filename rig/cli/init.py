@@ -6,7 +6,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -55,6 +55,10 @@ AppliedForce = Annotated[
 LoadCell = Annotated[
     str | None,
     typer.Option(metavar="MESSAGE.SIGNAL", help="Signal of the load cell in the strut, or `none`."),
+]
+DamperTemperature = Annotated[
+    str | None,
+    typer.Option(metavar="MESSAGE.SIGNAL", help="Signal of the damper's temperature, or `none`."),
 ]
 Mass = Annotated[
     float | None,
@@ -123,6 +127,7 @@ def init(
     height: Height = None,
     applied_force: AppliedForce = None,
     load_cell: LoadCell = None,
+    temperature: DamperTemperature = None,
     is_dyno: Annotated[
         bool,
         typer.Option(
@@ -162,7 +167,8 @@ def init(
             "--stiffness-n-per-m and --damping-n-s-per-m with them"
         )
     database = load_database(dbc)
-    signals = _find_signals(database, height, applied_force, load_cell, is_dyno=is_dyno)
+    names = SignalNames(height, applied_force, load_cell, temperature)
+    signals = _find_signals(database, names, is_dyno=is_dyno)
     proposal = Proposal(database, signals, BusConfig(interface, channel, bitrate), is_dyno)
     mass_kg = _known(
         mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
@@ -207,14 +213,16 @@ def _known(value: float | None, option: str, question: str, default: float | Non
     return answer
 
 
-def _find_signals(
-    database: "Database",
-    height: str | None,
-    applied_force: str | None,
-    load_cell: str | None,
-    *,
-    is_dyno: bool,
-) -> "Signals":
+class SignalNames(NamedTuple):
+    """Signals that options name, each None if it does not."""
+
+    height: str | None
+    applied_force: str | None
+    load_cell: str | None
+    temperature: str | None
+
+
+def _find_signals(database: "Database", given: SignalNames, *, is_dyno: bool) -> "Signals":
     from rig.new_bench.proposal import (
         Force,
         Signals,
@@ -225,10 +233,10 @@ def _find_signals(
         unknown_units,
     )
 
-    found = find_height(database, height)
+    found = find_height(database, given.height)
     names = {
-        Force.APPLIED: _NONE if is_dyno and applied_force is None else applied_force,
-        Force.IN_STRUT: load_cell,
+        Force.APPLIED: given.applied_force or (_NONE if is_dyno else None),
+        Force.IN_STRUT: given.load_cell,
     }
     forces = {
         force: None if name == _NONE else find_force(database, force, name)
@@ -237,7 +245,9 @@ def _find_signals(
     chosen_names = [choice.name for choice in forces.values() if choice]
     if len(set(chosen_names)) < len(chosen_names):  # one signal suits both: the user decides
         if None not in names.values():
-            raise InputError(f"--load-cell {load_cell}: is the applied force, expected another")
+            raise InputError(
+                f"--load-cell {given.load_cell}: is the applied force, expected another"
+            )
         forces = {
             force: choice if names[force] is not None else None for force, choice in forces.items()
         }
@@ -252,10 +262,18 @@ def _find_signals(
             if force in open_forces:
                 forces[force] = find_force(database, force, item.name)
         unclear = []
+    if unclear and len(open_forces) == len(names):
+        item = unclear[0].name
+        raise InputError(
+            f"{item} is a force, and it is not clear where it acts: expected --applied-force "
+            f"{item} for a force on the body, or --load-cell {item} for one in the strut (or none)"
+        )
     chosen = tuple(choice for choice in forces.values() if choice is not None)
     if is_dyno and not any(choice.quantity is Force.IN_STRUT.quantity for choice in chosen):
         raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
-    temperature = find_temperature(database, found.message.sender)
+    temperature = None
+    if given.temperature != _NONE:
+        temperature = find_temperature(database, found.message.sender, given.temperature)
     unknown = tuple(name for name in unknown_units(database) if name != found.name)
     return Signals(found, chosen, temperature, tuple(unclear), unknown)
 

@@ -225,9 +225,15 @@ def _estimates(database: Database) -> set[str]:
     return {item.name for item in ranked if item.is_likely}
 
 
-def find_temperature(database: Database, sender: str | None) -> Choice | None:
-    """The temperature of the damper: clearly named, or measured by the sender of the height."""
+def find_temperature(database: Database, sender: str | None, named: str | None) -> Choice | None:
+    """The temperature of the damper: named, clear by its name, or of the height's sender.
+
+    Raises:
+        InputError: There is no signal of that name.
+    """
     ranked = rank_signals(database.messages.values(), signal_ranking.TEMPERATURE)
+    if named is not None:
+        return _named(database, TEMPERATURE, named, ranked, "--temperature")
     likely = [
         item
         for item in ranked

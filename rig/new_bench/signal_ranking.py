@@ -152,7 +152,8 @@ STRUT_FORCE = Likeness(
 TEMPERATURE = Likeness(
     Dimension.TEMPERATURE,
     _weights(
-        plus_3="damper daempfer oil oel shock strut fluid",
+        plus_3="damper daempfer shock strut federbein stossdaempfer",
+        plus_2="oil oel fluid",
         plus_1="temp temperature temperatur",
         minus_2="ambient engine motor battery cell coolant inverter air outside aussen cpu board "
         "gearbox transmission exhaust tire tyre brake set setpoint",

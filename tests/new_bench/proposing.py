@@ -18,7 +18,7 @@ from rig.new_bench.proposal import (
 def find_signals(database: Database) -> Signals:
     height = find_height(database, None)
     forces = [it for force in Force if (it := find_force(database, force, None)) is not None]
-    temperature = find_temperature(database, height.message.sender)
+    temperature = find_temperature(database, height.message.sender, None)
     return Signals(height, tuple(forces), temperature, tuple(unclear_forces(database, forces)))
 
 

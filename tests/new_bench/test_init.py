@@ -15,6 +15,7 @@ from tests.plan.test_own_dbc import DBC
 
 VALID = ' SG_ ForceOk : 40|1@0+ (1,0) [0|1] "" SENSOR\n SG_ Setpoint'
 CYLINDER = 'BO_ 300 CELL: 8 SENSOR\n SG_ Force : 0|16@1- (0.1,0) [0|0] "daN" CONTROL\n\nBO_ 400'
+NO_FORCE = ("--applied-force", "none", "--load-cell", "none")
 FACTS = ("--mass-kg", "24", "--length-at-rest-m", "0.36", "--stiffness-n-per-m", "9000")
 
 
@@ -49,16 +50,29 @@ def test_what_is_written_passes_the_check(rig, tmp_path, capsys):
     assert "--out my.yaml: exists, expected a new file" in capsys.readouterr().err
 
 
-def test_a_force_of_which_nothing_says_where_it_acts_is_left_to_the_user(rig, capsys):
-    assert rig(*FACTS, "--json") == 0
+def test_where_a_force_acts_is_asked_for_before_anything_is_written(rig, tmp_path, capsys):
+    assert rig(*FACTS) == 2
+    assert "CELL.Force is a force, and it is not clear where it acts" in capsys.readouterr().err
+    assert not (tmp_path / "my.yaml").exists()
+    assert rig(*FACTS, "--load-cell", "none", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["unclear_forces"] == ["CELL.Force"]
     assert set(found["signals"]) == {"height", "temperature"}
     assert found["free_length_m"] == pytest.approx(0.36 + 24.0 * 9.81 / 9000.0)
 
 
+def test_the_temperature_is_the_one_that_is_named(rig, tmp_path):
+    assert rig(*FACTS, *NO_FORCE, "--temperature", "SENSOR_1.OilTemp") == 0
+    assert load_plan(tmp_path / "my.yaml").config.signals.temperature.signal == "OilTemp"
+    for file in ("my.yaml", "my_model.yaml"):
+        (tmp_path / file).unlink()
+    assert rig(*FACTS, *NO_FORCE, "--temperature", "none") == 0
+    bench = load_plan(tmp_path / "my.yaml").config.signals.bench
+    assert "temperature" not in {quantity.key for quantity in bench}
+
+
 def test_a_free_length_of_a_drawing_is_taken(rig, tmp_path):
-    assert rig(*FACTS, "--free-length-m", "0.412") == 0
+    assert rig(*FACTS, *NO_FORCE, "--free-length-m", "0.412") == 0
     (strut,) = load_plan(tmp_path / "my.yaml").model.struts
     assert strut.free_length_m == 0.412
     assert "0.412   # as stated" in (tmp_path / "my_model.yaml").read_text()
@@ -79,20 +93,15 @@ def test_a_load_cell_at_the_cylinder_measures_the_applied_force(rig, tmp_path, c
 def test_a_load_cell_of_which_nothing_says_where_it_is_is_left_to_the_user(rig, tmp_path, capsys):
     text = (tmp_path / "my.dbc").read_text()
     (tmp_path / "my.dbc").write_text(text + 'CM_ SG_ 300 Force "Load cell, see the sheet";\n')
-    assert rig(*FACTS, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["unclear_forces"] == ["CELL.Force"]
+    assert rig(*FACTS) == 2
+    assert "--load-cell CELL.Force for one in the strut" in capsys.readouterr().err
 
 
 def test_a_force_that_suits_both_places_is_mapped_to_the_one_that_is_named(rig, tmp_path, capsys):
     text = (tmp_path / "my.dbc").read_text()
     (tmp_path / "my.dbc").write_text(text.replace("SG_ Force", "SG_ ShockInput"))
-    assert rig(*FACTS, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert "CELL.ShockInput" in found["unclear_forces"]
-    assert not {"applied_force", "load_cell_force"} & set(found["signals"])
-    for file in ("my.yaml", "my_model.yaml"):
-        (tmp_path / file).unlink()
+    assert rig(*FACTS) == 2
+    assert "CELL.ShockInput is a force" in capsys.readouterr().err
     assert rig(*FACTS, "--applied-force", "CELL.ShockInput", "--load-cell", "CELL.ShockInput") == 2
     assert "--load-cell CELL.ShockInput: is the applied force" in capsys.readouterr().err
     assert rig(*FACTS, "--applied-force", "CELL.ShockInput") == 0
@@ -105,7 +114,7 @@ def test_a_force_that_suits_both_places_is_mapped_to_the_one_that_is_named(rig, 
 
 def test_what_options_leave_open_is_named(rig, capsys):
     for number in range(0, len(FACTS), 2):
-        assert rig(*FACTS[:number], *FACTS[number + 2 :]) == 2
+        assert rig(*FACTS[:number], *FACTS[number + 2 :], *NO_FORCE) == 2
         assert f"{FACTS[number]}: required" in capsys.readouterr().err
 
 
@@ -162,7 +171,7 @@ def test_what_a_dbc_holds_that_cannot_be_read_is_listed(rig, tmp_path, capsys):
         ' SG_ A : 0|9@1+ (1,0) [0|0] "" SENSOR\n SG_ B : 8|8@1+ (1,0) [0|0] "" SENSOR\n\nBA_DEF_ '
     )
     path.write_text(path.read_text().replace("BA_DEF_ ", overlap, 1))
-    assert rig(*FACTS) == 0
+    assert rig(*FACTS, *NO_FORCE) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "Passed over in my.dbc: message OTHER: The signals" in shown
 
