@@ -59,10 +59,12 @@ class Gaps(NamedTuple):
         )
         if not long:
             return f"{text}. They are short enough to be interpolated."
+        mean_s = self.duration_s / (long + 1)
         return (
             f"{text}. In {long} of them it changes too much to be interpolated (longer than "
-            f"{self.longest_interpolated_s:.2g} s): a diagnosis divides the run there. If they are "
-            "many, record it again, with less load on the computer and the bus."
+            f"{self.longest_interpolated_s:.2g} s): a diagnosis divides the run there, into parts "
+            f"of {mean_s:.2g} s on average. If these do not hold several periods of the motion "
+            "each, record it again, with less load on the computer and the bus."
         )
 
     def as_dict(self) -> dict[str, object]:
