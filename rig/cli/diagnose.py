@@ -10,6 +10,9 @@ from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
 from rig.cli.terminal import JsonFlag, print_text, refuse_existing
 
+_FAR_LESS = 0.5
+"""Share of the residual force from which on a corrected model is worth its corrections."""
+
 EXAMPLES = "Example: `rig diagnose runs/7 --model model.yaml --held-out runs/8 --out found`"
 
 
@@ -61,16 +64,21 @@ def diagnose(
     print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
         print_text(f"Printed: {out}/report.pdf")
+    force, floor = result.diagnosis.held_out.residual_force_rmse_n, result.diagnosis.noise_floor
     if result.diagnosis.verdict == "not_explained":
-        print_text(f"No law explains what {model} lacks: continue with {model}.")
-        return
+        if not force.after < _FAR_LESS * force.before:
+            print_text(f"No law explains what {model} lacks: continue with {model}.")
+            return
+        print_text(
+            f"No law explains what remains, but {out}/corrected.yaml lacks {force.after:.3g} N RMS "
+            f"instead of {force.before:.3g} N."
+        )
     if result.diagnosis.verdict == "partly_explained":
         others = "".join(f" --held-out {path}" for path in held_out or [])
-        force, floor = result.diagnosis.held_out.residual_force_rmse_n, result.diagnosis.noise_floor
         print_text(
             f"The corrected model still lacks {force.after:.3g} N RMS of {force.before:.3g} N "
             f"(noise alone: {floor.residual_force_rmse_n:.2g} N). Only if that is too much for "
-            "your use, diagnose what it lacks, which takes longer: `rig diagnose "
+            "your use, diagnose what it lacks: `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )
     is_driven = result.diagnosis.held_out.strut_force_rmse_n is None

@@ -375,6 +375,10 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "In these data a gain of the applied force is indistinguishable from a change of mass, "
             "stiffness and damping in one proportion. Weigh the mass to separate the two."
         )
+    if len(search.chosen.fit.candidate.new) > 1:
+        notes.append(
+            "Several effects act together: fewer than 95 % of such intervals contain the true value."
+        )
     notes += _notes_of_tolerances(problem, search.chosen.fit)
     if _resembles_hold(problem, search.chosen.fit):
         notes.append(

@@ -164,6 +164,11 @@ def find_height(database: Database, named: str | None) -> Choice:
                 else ": is this the DBC of the bench? `rig sensor scan` finds sensors without one"
             )
         )
+    fine = [item for item in ranked if signal_ranking.is_fast_and_fine(item)]
+    if not ranked[0].is_likely and len(fine) == 1:
+        others = tuple(item.name for item in ranked if item is not fine[0])
+        why = "the only length that is sent often, in fine steps"
+        return Choice(HEIGHT, fine[0].message, fine[0].signal, why, others)
     if not ranked[0].is_likely:
         lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
         more = ", ..." if len(ranked) > _MOST_OTHERS else ""

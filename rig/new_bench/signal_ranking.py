@@ -33,6 +33,9 @@ _LEAST_BITS = 12
 _OTHERS = ("%", "V", "mV", "A", "mA", "bar", "Pa", "kPa", "MPa", "deg", "rad", "Hz", "rpm", "1/min")
 """Units of other quantities of a bench."""
 
+_FINE_M = 1e-4
+"""Step of a position sensor; a radar, a level or an odometer counts in millimetres at best."""
+
 _FAST_S, _SLOW_S = 0.02, 0.2
 """Cycles of a sensor by which a strut can be followed, and of one by which it cannot."""
 
@@ -227,6 +230,13 @@ def measures(signal: Signal, dimension: Dimension) -> bool:
     except DatabaseError:
         return False
     return True
+
+
+def is_fast_and_fine(item: RankedSignal) -> bool:
+    """Whether a length has the cycle and the step of a position sensor, as no radar has."""
+    cycle_ns = item.message.cycle_time_ns
+    step = si_step(item.message, item.signal.name, Dimension.LENGTH)
+    return cycle_ns is not None and cycle_ns * 1e-9 <= _FAST_S and 0.0 < step <= _FINE_M
 
 
 def _score(message: Message, signal: Signal, likeness: Likeness) -> RankedSignal:

@@ -86,6 +86,12 @@ MM = '(0.01,0) [0|300] "mm"'
         ({"Ch1": MM, "Ch2": MM}, 'CM_ SG_ 2 Ch2 "stroke of the damper";', "M2.Ch2"),
         # Names alike: the faster one.
         ({"Stroke1": MM, "Stroke2": MM}, 'BA_ "GenMsgCycleTime" BO_ 2 5;', "M2.Stroke2"),
+        # No word, but a sensor's cycle and step.
+        (
+            {"Odometer": '(0.001,0) [0|65] "km"', "Dist": MM},
+            'BA_ "GenMsgCycleTime" BO_ 2 2;',
+            "M2.Dist",
+        ),
         # `override` is no ride height, and a quantity may stand before the unit.
         ({"Override": MM, "RideHgt": '(0.01,0) [0|300] "distance:mm"'}, "", "M2.RideHgt"),
     ],
