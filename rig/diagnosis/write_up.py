@@ -377,7 +377,8 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
         )
     if len(search.chosen.fit.candidate.new) > 1:
         notes.append(
-            "Several effects act together: fewer than 95 % of such intervals contain the true value."
+            "Several effects act together: fewer than 95 % of such intervals contain the true "
+            "value."
         )
     notes += _notes_of_tolerances(problem, search.chosen.fit)
     if _resembles_hold(problem, search.chosen.fit):
