@@ -7,7 +7,7 @@ signal that marks the estimate as invalid, and limits on what a height sensor ca
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from can_dbc.codec import si_step
@@ -164,21 +164,20 @@ def find_height(database: Database, named: str | None) -> Choice:
                 else ": is this the DBC of the bench? `rig sensor scan` finds sensors without one"
             )
         )
+    if ranked[0].is_likely:
+        return _choice(HEIGHT, ranked[0], ranked)
     fine = [item for item in ranked if signal_ranking.is_fast_and_fine(item)]
-    if not ranked[0].is_likely and len(fine) == 1:
-        others = tuple(item.name for item in ranked if item is not fine[0])
+    if len(fine) == 1:
         why = "the only length that is sent often, in fine steps"
-        return Choice(HEIGHT, fine[0].message, fine[0].signal, why, others)
-    if not ranked[0].is_likely:
-        lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
-        more = ", ..." if len(ranked) > _MOST_OTHERS else ""
-        counts = unknown_units(database)[:_MOST_OTHERS]
-        unknown = f"; {' or '.join(counts)} has no unit that is known" if counts else ""
-        raise InputError(
-            f"{database.path}: no length looks like the height of a strut (there are {lengths}"
-            f"{more}{unknown}): name it with --height MESSAGE.SIGNAL"
-        )
-    return _choice(HEIGHT, ranked[0], ranked)
+        return replace(_choice(HEIGHT, fine[0], ranked), why=why)
+    lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
+    more = ", ..." if len(ranked) > _MOST_OTHERS else ""
+    counts = unknown_units(database)[:_MOST_OTHERS]
+    unknown = f"; {' or '.join(counts)} has no unit that is known" if counts else ""
+    raise InputError(
+        f"{database.path}: no length looks like the height of a strut (there are {lengths}"
+        f"{more}{unknown}): name it with --height MESSAGE.SIGNAL"
+    )
 
 
 def unknown_units(database: Database) -> list[str]:
@@ -463,7 +462,8 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
 def _lines_of_own_message(database: Database) -> list[str]:
     """A message for the estimate that the DBC lacks, and how it is published, as comments."""
     used = {message.arbitration_id for message in database.messages.values()}
-    own = next(number for number in range(_FIRST_OWN_ID, _LAST_OWN_ID) if number not in used)
+    free = (number for number in range(_FIRST_OWN_ID, _LAST_OWN_ID) if number not in used)
+    own = next(free, _FIRST_OWN_ID)
     return [
         "# No message of the DBC looks like one for the estimate, so it is not published. To",
         "# publish it, add these three lines to the DBC, after its last message (BO_), with an",

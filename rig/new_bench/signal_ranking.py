@@ -99,14 +99,13 @@ HEIGHT = Likeness(
         "einfederung federbein ridehgt rideheight ride wire potentiometer pot jounce",
         plus_2="height hght hoehe travel displacement displ stringpot weg wegsensor level niveau",
         plus_1="pos position length laenge hub spring feder corner axle achse encoder enc",
-        minus_2="distance dist",
         minus_4="odo odometer trip range reichweite altitude gps latitude longitude "
         "lane radar object obj target curve kurve snow rain urea fuel tank tire tyre circumference "
         "throttle brake pedal clutch steer steering rack valve camera cam parking obstacle "
         "pedestrian waypoint path route road gap lateral wheelbase track trk vehicle ahead "
         "mileage km seat injector crank oil oel attitude cloud visibility width potential",
-        minus_2_0="offset setpoint soll cmd command request req nominal target demand raw prev "
-        "model estimated simulated",
+        minus_2="distance dist offset setpoint soll cmd command request req nominal target demand "
+        "raw prev model estimated simulated",
     ),
     spans=((0.005, 2.0), (0.0, 20.0)),
     step=1e-3,
@@ -206,7 +205,7 @@ def counts(messages: Iterable[Message]) -> list[tuple[Message, Signal]]:
     return [
         (message, signal)
         for message in messages
-        if message.cycle_time_ns is None or message.cycle_time_ns * 1e-9 <= _FAST_S
+        if message.cycle_time_ns is None or _is_fast(message)
         for signal in message.signals.values()
         if signal.unit and signal.length_bits >= _LEAST_BITS and is_count(signal)
     ]
@@ -234,9 +233,13 @@ def measures(signal: Signal, dimension: Dimension) -> bool:
 
 def is_fast_and_fine(item: RankedSignal) -> bool:
     """Whether a length has the cycle and the step of a position sensor, as no radar has."""
-    cycle_ns = item.message.cycle_time_ns
     step = si_step(item.message, item.signal.name, Dimension.LENGTH)
-    return cycle_ns is not None and cycle_ns * 1e-9 <= _FAST_S and 0.0 < step <= _FINE_M
+    return _is_fast(item.message) and 0.0 < step <= _FINE_M
+
+
+def _is_fast(message: Message) -> bool:
+    """Whether the DBC gives a message a cycle by which a strut can be followed."""
+    return message.cycle_time_ns is not None and message.cycle_time_ns * 1e-9 <= _FAST_S
 
 
 def _score(message: Message, signal: Signal, likeness: Likeness) -> RankedSignal:
@@ -302,7 +305,7 @@ def _cycle_score(message: Message, likeness: Likeness) -> _Scored:
         return 0.0, ""
     cycle_s = message.cycle_time_ns * 1e-9
     why = f"every {cycle_s * 1e3:g} ms"
-    if cycle_s <= _FAST_S:
+    if _is_fast(message):
         return likeness.cycle_weight, why
     return (-likeness.cycle_weight if cycle_s >= _SLOW_S else 0.0), why
 

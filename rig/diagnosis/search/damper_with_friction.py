@@ -1,8 +1,8 @@
 """A start for friction and the valves of a damper together, along the motion.
 
 A damper law that rises steeply from rest imitates friction, and friction such a damper: from either
-alone, or from both one after the other, a fit ends in the valley of the imitation. At
-given knees the force of both is linear in its four sizes, so that these have no valley.
+alone, or from both one after the other, a fit ends in the valley of the imitation. At given knees
+the force of both is linear in its four sizes, so that these have no valley.
 """
 
 import itertools
