@@ -280,6 +280,7 @@ def test_flood(row):
     counts, sent = ticks[-1].counts, 20 * (END_MS - BEGIN_MS)
     assert counts.wrong_crc + counts.masquerade > 0.99 * sent
     assert len(wrong) <= sent // 5000
+    assert counts.stale < 0.02 * (END_MS - BEGIN_MS)
     error_n = force_error_n(ticks)
     row(
         10,
