@@ -21,6 +21,11 @@ _LONGEST_READ_S = 120.0
 """Longest run that is read again at its end, which takes about 4 % of its duration."""
 
 
+def _is_long(ended: "Ended") -> bool:
+    """Whether a run is too long to be read again at its end."""
+    return ended.ticks * ended.period_ns > _LONGEST_READ_S * 1e9
+
+
 def _summary_text(ended: "Ended") -> str:
     return json.dumps(ended.summary(), indent=2) + "\n"
 
@@ -78,7 +83,7 @@ def _print_stated_std(plan: "Plan", ended: "Ended", folder: Path) -> None:
     from rig.log.reader import read_run
 
     stating = [it.name for it in plan.struts if it.observer.knows_std]
-    if not stating or ended.ticks * plan.period_ns > _LONGEST_READ_S * 1e9:
+    if not stating or _is_long(ended):
         return
     try:
         steps = read_run(folder).steps
@@ -101,21 +106,22 @@ def _gaps_of(ended: "Ended", folder: Path) -> "Gaps | None":
     from rig.recordings.run_folder import read_run
 
     counts = ended.state.counts
-    duration_s = ended.ticks * ended.period_ns * 1e-9
     is_whole = not (counts.lost or counts.refused or counts.stale or counts.overruns)
-    if is_whole or duration_s > _LONGEST_READ_S:
+    if is_whole or _is_long(ended):
         return None
     with contextlib.suppress(InputError):  # `rig diagnose` reports what is wrong with a recording
         return read_run(folder).force_gaps
     return None
 
 
-def _describe_heights(plan: "Plan", folder: Path) -> str:
+def _describe_heights(plan: "Plan", ended: "Ended", folder: Path) -> str:
     """What arrived of each height in a run that did not start, a line for each."""
     from rig.log.reader import read_run
     from rig.recordings.run_folder import read_channel
     from rig.sensors.mounting import describe_arrivals
 
+    if _is_long(ended):
+        return ""
     with contextlib.suppress(InputError):  # nothing was logged
         run = read_run(folder)
         return "".join(
@@ -135,8 +141,9 @@ def _refuse_bad_end(plan: "Plan", ended: "Ended", folder: Path) -> None:
 
     stderr = Console(stderr=True)
     if ended.state.mode is Mode.WAITING:
+        heights = _describe_heights(plan, ended, folder)
         stderr.print(
-            f"The model did not start: no valid height arrived.{_describe_heights(plan, folder)}",
+            f"The model did not start: no valid height arrived.{heights}",
             style="red",
             highlight=False,
             soft_wrap=True,

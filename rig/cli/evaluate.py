@@ -37,6 +37,9 @@ def evaluate_command(
 
     No observer is used, and only the initial states are fitted. If the motion is prescribed, the
     force of the model along the measured motion is compared with the load cell.
+
+    Each model has its own noise floor, because the noise of the applied force moves each model
+    differently. That of the model with the smallest error is the one to compare with.
     """
     from dart_model.spec import load_named_model
     from rig.diagnosis.evaluate import evaluate_model

@@ -6,7 +6,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,9 +23,8 @@ from rig.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from can_dbc.database import Database
     from rig.new_bench.first_model import FirstModel, LinearFit
-    from rig.new_bench.proposal import Force, Proposal, Signals
+    from rig.new_bench.proposal import Force, Proposal
 
 EXAMPLES = (
     "Examples: `rig init --dbc my.dbc --out my.yaml`, which asks for the rest · `rig init --dbc "
@@ -33,9 +32,6 @@ EXAMPLES = (
     "`--listen-s 10`, stiffness and damping from ten seconds of motion; with `--run sweep.csv`, "
     "from a recording"
 )
-
-_NONE = "none"
-"""Instead of a signal's name: the bench does not measure it."""
 
 _ROUGH_HZ = 2.0
 """Natural frequency of the model by which a recording is read: it has no effect on what is read."""
@@ -155,6 +151,7 @@ def init(
     from can_dbc.database import load_database
     from rig.bus.bus import BusConfig
     from rig.new_bench.proposal import Proposal
+    from rig.new_bench.signal_choice import SignalNames, choose_signals
 
     model_file = out.with_name(f"{out.stem}_model.yaml")
     refuse_existing(out, model_file, option="--out ")
@@ -168,7 +165,8 @@ def init(
         )
     database = load_database(dbc)
     names = SignalNames(height, applied_force, load_cell, temperature)
-    signals = _find_signals(database, names, is_dyno=is_dyno)
+    ask = _ask_place if sys.stdin.isatty() else None
+    signals = choose_signals(database, names, ask, is_dyno=is_dyno)
     proposal = Proposal(database, signals, BusConfig(interface, channel, bitrate), is_dyno)
     mass_kg = _known(
         mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
@@ -211,71 +209,6 @@ def _known(value: float | None, option: str, question: str, default: float | Non
     if not 0.0 < answer < 1e9:
         raise InputError(f"{question}: {answer:g}, expected a positive number")
     return answer
-
-
-class SignalNames(NamedTuple):
-    """Signals that options name, each None if it does not."""
-
-    height: str | None
-    applied_force: str | None
-    load_cell: str | None
-    temperature: str | None
-
-
-def _find_signals(database: "Database", given: SignalNames, *, is_dyno: bool) -> "Signals":
-    from rig.new_bench.proposal import (
-        Force,
-        Signals,
-        find_force,
-        find_height,
-        find_temperature,
-        unclear_forces,
-        unknown_units,
-    )
-
-    found = find_height(database, given.height)
-    names = {
-        Force.APPLIED: given.applied_force or (_NONE if is_dyno else None),
-        Force.IN_STRUT: given.load_cell,
-    }
-    forces = {
-        force: None if name == _NONE else find_force(database, force, name)
-        for force, name in names.items()
-    }
-    chosen_names = [choice.name for choice in forces.values() if choice]
-    if len(set(chosen_names)) < len(chosen_names):  # one signal suits both: the user decides
-        if None not in names.values():
-            raise InputError(
-                f"--load-cell {given.load_cell}: is the applied force, expected another"
-            )
-        forces = {
-            force: choice if names[force] is not None else None for force, choice in forces.items()
-        }
-    open_forces = [force for force, name in names.items() if name is None and not forces[force]]
-    unclear = unclear_forces(database, [it for it in forces.values() if it]) if open_forces else []
-    if is_dyno and len(unclear) == 1 and not forces[Force.IN_STRUT]:
-        # A dyno measures no other force.
-        forces[Force.IN_STRUT] = find_force(database, Force.IN_STRUT, unclear.pop().name)
-    if unclear and sys.stdin.isatty():
-        for item in unclear[: len(open_forces)]:
-            force = _ask_place(item.name)
-            if force in open_forces:
-                forces[force] = find_force(database, force, item.name)
-        unclear = []
-    if unclear and len(open_forces) == len(names):
-        item = unclear[0].name
-        raise InputError(
-            f"{item} is a force, and it is not clear where it acts: expected --applied-force "
-            f"{item} for a force on the body, or --load-cell {item} for one in the strut (or none)"
-        )
-    chosen = tuple(choice for choice in forces.values() if choice is not None)
-    if is_dyno and not any(choice.quantity is Force.IN_STRUT.quantity for choice in chosen):
-        raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
-    temperature = None
-    if given.temperature != _NONE:
-        temperature = find_temperature(database, found.message.sender, given.temperature)
-    unknown = tuple(name for name in unknown_units(database) if name != found.name)
-    return Signals(found, chosen, temperature, tuple(unclear), unknown)
 
 
 def _ask_place(name: str) -> "Force | None":

@@ -19,6 +19,7 @@ from rig.cli.terminal import (
 
 if TYPE_CHECKING:
     from rig.plan.plan import Plan
+    from rig.tuning.latency import Latency
     from rig.tuning.tune import StatedExpectation, TunedStrut
 
 EXAMPLES = (
@@ -30,6 +31,9 @@ EXAMPLES = (
 
 _HARDLY = 0.8
 """Share of the configured observer's expected error above which tuning hardly helps."""
+
+_WORTH_A_LINE = 0.5
+"""Share of the residual force that a force which arrives late must cause to be reported."""
 
 Run = Annotated[
     Path | None,
@@ -207,18 +211,14 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
         f"Height: noise {1e6 * expectation.noise_std_m:.3g} µm. Residual force: {rms_n:.3g} N RMS "
         f"({expectation.source})."
     )
-    if strut.latency is not None and strut.latency.std_s == float("inf"):
-        console.print(
-            "Height latency: cannot be determined from this run, probably because it contains a "
-            "single frequency. Record a sweep or a multisine."
-        )
-    elif strut.latency is not None:
-        low_ms, high_ms = 1e3 * max(strut.latency.low_s, 0.0), 1e3 * strut.latency.high_s
-        verdict = "" if strut.delay_s else "; indistinguishable from zero, so none is set"
+    if expectation.by_late_force_n > _WORTH_A_LINE * rms_n:
         print_text(
-            f"Latency of the height: {1e3 * strut.latency.delay_s:.3g} ms (95 %: {low_ms:.3g} to "
-            f"{high_ms:.3g} ms){verdict}."
+            f"Of it, {expectation.by_late_force_n:.3g} N RMS are proportional to the rate of the "
+            "applied force, which reaches the model later than the height. `rig diagnose` "
+            "and `rig evaluate` use the times of the samples and do not contain this part."
         )
+    if strut.latency is not None:
+        _print_latency(strut.latency, is_set=bool(strut.delay_s))
     slowest = ", ".join(
         f"{pole.frequency_hz:.3g} Hz with {pole.damping_ratio:.2f}"
         for pole in chosen.expected.poles[:6]
@@ -244,6 +244,28 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
             f"No gains settle within {chosen.required_settling_s:g} s; the best settle in "
             f"{_time_text(chosen.expected.settling_s)}.",
             style="yellow",
+        )
+
+
+def _print_latency(latency: "Latency", *, is_set: bool) -> None:
+    low_ms, value_ms, high_ms = (
+        1e3 * it for it in (latency.low_s, latency.delay_s, latency.high_s)
+    )
+    if latency.std_s == float("inf"):
+        console.print(
+            "Latency of the height: cannot be determined from this run; it contains a single "
+            "frequency, or too little that the observer follows. Record a sweep or a multisine."
+        )
+    elif high_ms < 0.0:
+        print_text(
+            f"Latency of the height: none. The applied force arrives {-value_ms:.3g} ms later than "
+            f"the height (95 %: {-high_ms:.3g} to {-low_ms:.3g} ms)."
+        )
+    else:
+        verdict = "" if is_set else "; indistinguishable from zero, so none is set"
+        print_text(
+            f"Latency of the height: {max(value_ms, 0.0):.3g} ms (95 %: {max(low_ms, 0.0):.3g} to "
+            f"{high_ms:.3g} ms){verdict}."
         )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
+from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import (
     Diagnosis,
     Estimate,
@@ -105,6 +106,7 @@ def compose_result(
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
     estimates = FitEstimates(chosen, fit_covariance(chosen))
+    corrected = spec_with_corrections(problem, chosen.model)
     ambiguous = verdict == "ambiguous"
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
@@ -125,6 +127,7 @@ def compose_result(
             is_white(problem, chosen, criteria.white),
         ),
         _notes(problem, search, by_blocks=by_blocks)
+        + _notes_of_springs(problem, chosen, corrected)
         + _notes_of_friction_like_laws(problem, chosen, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
@@ -133,7 +136,7 @@ def compose_result(
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)
     return Result(
         diagnosis,
-        spec_with_corrections(problem, chosen.model),
+        corrected,
         tuple(item for items in series for item in items),
         tuple(item for run in evaluations for item in run.series),
     )
@@ -380,6 +383,11 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "Several effects act together: fewer than 95 % of such intervals contain the true "
             "value."
         )
+    if any(p.kind == "mass" for p in _free(problem, search.chosen.fit)) and not search.gain_alike:
+        notes.append(
+            "The intervals assume that the scale of the applied force is right: where that is "
+            "wrong by 1 %, masses, stiffnesses, damping and forces are, too."
+        )
     notes += _notes_of_tolerances(problem, search.chosen.fit)
     if _resembles_hold(problem, search.chosen.fit):
         notes.append(
@@ -407,6 +415,29 @@ def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
                 "describe the strut?"
             )
     return notes
+
+
+def _notes_of_springs(problem: Problem, result: Fit, corrected: ModelSpec) -> tuple[str, ...]:
+    """How the corrected model file states a stiffness that was corrected about mid-stroke."""
+    notes: list[str] = []
+    for parameter, change in zip(problem.linear, result.parts.linear, strict=True):
+        before, after = problem.spec.struts[parameter.strut], corrected.struts[parameter.strut]
+        if parameter.kind != "stiffness" or change == 0.0 or after.stiffness_n_per_m == 0.0:
+            continue
+        constant_n = sum(
+            sign * item.parameters["force_n"]
+            for sign, strut in ((1.0, after), (-1.0, before))
+            for item in strut.effects
+            if item.name == "preload"
+        )
+        length_m = after.free_length_m + constant_n / after.stiffness_n_per_m
+        notes.append(
+            f"The stiffness of strut {before.name} is corrected about "
+            f"{mid_stroke_m(problem.motions[parameter.strut]):.4g} m. The corrected model states "
+            f"this as the new stiffness and {constant_n:+.3g} N of preload, which together are a "
+            f"linear spring of the free length {length_m:.4g} m."
+        )
+    return tuple(notes)
 
 
 def _notes_of_friction_like_laws(

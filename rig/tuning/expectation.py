@@ -44,6 +44,8 @@ class FollowedStretch(NamedTuple):
         law_force_n: Force of the model's law at them, shape (M,).
         height_m: Model heights at them, shape (M,).
         velocity_m_per_s: Model velocities at them, shape (M,).
+        applied_n: Applied force with which the model was computed at them, shape (M,); zero where
+            none is known.
     """
 
     t_s: Array
@@ -52,6 +54,7 @@ class FollowedStretch(NamedTuple):
     law_force_n: Array
     height_m: Array
     velocity_m_per_s: Array
+    applied_n: Array
 
 
 class Expectation(NamedTuple):
@@ -62,12 +65,15 @@ class Expectation(NamedTuple):
         frequency_hz: Frequencies of the residual force, shape (N,).
         power_n2: Its mean square at them, shape (N,).
         source: Their source, as a phrase.
+        by_late_force_n: RMS of the part that is proportional to the rate of the applied force: a
+            force that reaches the model late leaves it, whatever the model is.
     """
 
     noise_std_m: float
     frequency_hz: Array
     power_n2: Array
     source: str
+    by_late_force_n: float = 0.0
 
 
 def longest_stretch(
@@ -105,7 +111,8 @@ def longest_stretch(
     free_m = free_error(tick_s, -virtual_n * mobility_per_kg, t_s, innovation_m[fresh])
     law = ("law_force_n", "height_m", "velocity_m_per_s")
     law_n, height_m, velocity = (column(f"{strut}.{name}")[stretch] for name in law)
-    return FollowedStretch(t_s, free_m, tick_s, law_n, height_m, velocity)
+    applied_n = np.nan_to_num(column("applied_force_n")[stretch])
+    return FollowedStretch(t_s, free_m, tick_s, law_n, height_m, velocity, applied_n)
 
 
 def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) -> Array:
@@ -137,7 +144,17 @@ def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Ex
     """
     stretch = longest_stretch(read_run(folder).steps, folder, strut, mobility_per_kg)
     noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
-    return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), str(folder))
+    by_late_n = part_by_late_force(stretch, force_n)
+    source = f"{folder}, {np.ptp(stretch.tick_s):.3g} s in RUNNING"
+    return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), source, by_late_n)
+
+
+def part_by_late_force(stretch: FollowedStretch, force_n: Array) -> float:
+    """RMS of the part of a residual force that is proportional to the applied force's rate."""
+    applied_n = np.interp(stretch.t_s, stretch.tick_s, stretch.applied_n)
+    rate = np.gradient(applied_n, stretch.t_s)
+    power = float(rate @ rate)
+    return abs(float(force_n @ rate)) / (power * len(rate)) ** 0.5 if power > 0.0 else 0.0
 
 
 def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:

@@ -8,7 +8,8 @@ derivative by the delay: the part of that derivative that the functions cannot r
 the error of the delay and its variance. This is repeated until it converges (Gauss and Newton).
 
 A bench moved by a single sine does not determine the delay: whatever is periodic is a function of
-height and velocity there. The interval is infinite then.
+height and velocity there. Neither does a run that the observer follows for too short a time. The
+interval is infinite then.
 """
 
 import math
@@ -17,11 +18,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.observers.kalman import KalmanObserver
 from rig.plan.plan import Plan
 from rig.run.replay import replay
-from rig.tuning.expectation import Array, longest_stretch, residual_force
+from rig.tuning.expectation import FEWEST, Array, longest_stretch, residual_force
 
 _DEGREE = 7
 """Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
@@ -44,7 +46,10 @@ _SETTLED_S = 0.3
 
 
 class Latency(NamedTuple):
-    """A delay, and its standard deviation: infinite where the run does not determine it."""
+    """A delay, and its standard deviation: infinite where the run does not determine it.
+
+    The delay is negative where the applied force arrives later than the height.
+    """
 
     delay_s: float
     std_s: float
@@ -67,6 +72,10 @@ class _Series(NamedTuple):
     height_m: Array
     velocity_m_per_s: Array
     force_n: Array
+
+    def part(self, is_in: NDArray[np.bool_]) -> "_Series":
+        """The part of it that a mask of shape (N,) selects."""
+        return _Series(*(column[is_in] for column in self))
 
 
 def with_delay(plan: Plan, delay_s: float) -> Plan:
@@ -92,22 +101,22 @@ def estimate_latency(
     plan: Plan,
     strut: str,
     mobility_per_kg: float,
-    observer: KalmanObserver,
+    observer_for: Callable[[float], KalmanObserver],
     progress: Callable[[float], None],
 ) -> Latency:
     """The delay of a strut's height.
 
-    The observer is a noise-aware one, which fits the strut's noise and residual force; the mobility
-    is the acceleration of its height per newton in it. `progress` is called with the share that is
-    done.
+    The mobility is the acceleration of its height per newton in it. `observer_for` gives a
+    noise-aware observer whose loop is stable with a delay; `progress` is called with the share that
+    is done.
 
     Raises:
         InputError: The run is damaged or too short.
     """
-    plan = plan.with_observers({strut: observer})
 
-    def series(delay_s: float) -> _Series:
-        steps = replay(folder, plan=with_delay(plan, delay_s)).steps
+    def series(delay_s: float, observer: KalmanObserver) -> _Series:
+        delayed = with_delay(plan.with_observers({strut: observer}), delay_s)
+        steps = replay(folder, plan=delayed).steps
         stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
         _, residual_n = residual_force(stretch, mobility_per_kg)
         is_settled = stretch.t_s > stretch.tick_s[0] + _SETTLED_S
@@ -119,19 +128,24 @@ def estimate_latency(
         )
         return _Series(t_s + delay_s, height, velocity, law_n + residual_n[is_used])
 
-    delay_s, std_s = 0.0, math.inf
+    delay_s, found_s, std_s = 0.0, 0.0, math.inf
     for number in range(_ITERATIONS):
-        step_s, std_s = _delay_step(series(delay_s), series(delay_s + _STEP_S))
+        observer = observer_for(delay_s)
+        step_s, std_s = _delay_step(series(delay_s, observer), series(delay_s + _STEP_S, observer))
         progress((number + 1) / _ITERATIONS)
-        before_s = delay_s
-        delay_s = min(max(delay_s + step_s, 0.0), _LONGEST_S)
+        found_s, before_s = delay_s + step_s, delay_s
+        delay_s = min(max(found_s, 0.0), _LONGEST_S)
         if not math.isfinite(std_s) or abs(delay_s - before_s) < 0.1 * std_s:
             break
-    return Latency(delay_s, std_s)
+    return Latency(min(found_s, _LONGEST_S), std_s)
 
 
 def _delay_step(here: _Series, later: _Series) -> tuple[float, float]:
-    """Error of the delay, and its standard deviation."""
+    """Error of the delay, and its standard deviation, from where the observer followed in both."""
+    first_s, last_s = later.arrived_s[[0, -1]]
+    here = here.part((first_s <= here.arrived_s) & (here.arrived_s <= last_s))
+    if len(here.arrived_s) < FEWEST:
+        return 0.0, math.inf
     slope = np.interp(here.arrived_s, later.arrived_s, later.force_n) - here.force_n
     slope = slope / _STEP_S
     rows = _functions(here.height_m, here.velocity_m_per_s)

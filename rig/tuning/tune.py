@@ -1,6 +1,7 @@
 """From a configuration and a run to a configuration with tuned observers."""
 
 import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -114,19 +115,22 @@ def tune(
     for index, strut in enumerate(plan.struts):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
         part = within(progress, *share, of=strut.name)
-        latency, delay_s = _find_delay(
-            plan, source, strut.name, responses[index].mobility_per_kg, others[index], part
-        )
-        problem = TuningProblem(
-            plant,
-            others,
-            index,
-            responses,
-            heights_m,
-            SampleTiming.of(plan.period_ns, strut.interval_ns, round(delay_s * 1e9)),
-            expectations[index],
-            cast("AnyTunableObserver", strut.observer).force_limit_n,
-        )
+
+        def problem_at(delay_s: float, index: int = index) -> TuningProblem:
+            interval_ns, observer = plan.struts[index].interval_ns, plan.struts[index].observer
+            return TuningProblem(
+                plant,
+                others,
+                index,
+                responses,
+                heights_m,
+                SampleTiming.of(plan.period_ns, interval_ns, round(delay_s * 1e9)),
+                expectations[index],
+                cast("AnyTunableObserver", observer).force_limit_n,
+            )
+
+        latency, delay_s = _find_delay(plan, source, problem_at, aim, part)
+        problem = problem_at(delay_s)
         part("gains", 0.7)
         chosen = tune_observer(problem, kind, aim)
         part("other bandwidths", 0.9)
@@ -159,26 +163,31 @@ def _expectation(
 def _find_delay(
     plan: Plan,
     source: Path | StatedExpectation,
-    strut: str,
-    mobility_per_kg: float,
-    observer: KalmanObserver,
+    problem_at: Callable[[float], TuningProblem],
+    aim: Aim,
     progress: Progress,
 ) -> tuple[Latency | None, float]:
     """Latency of a height as the run shows it, None where it is given, and the delay to tune with.
 
     The configuration gives the delay, or the run does where that gives none.
     """
+    at_once = problem_at(0.0)
+    strut = plan.struts[at_once.strut].name
     delay_s = plan.config.signals.height[strut].delay_s
     if delay_s or not isinstance(source, Path):
         return None, delay_s
     # The run's own signals and bus, with the model that is tuned.
     own = plan_of_run(source).with_model(plan.model)
+
+    def follow(delay_s: float) -> KalmanObserver:
+        return cast("KalmanObserver", tune_observer(problem_at(delay_s), "kalman", aim).observer)
+
     latency = estimate_latency(
         source,
         own,
         strut,
-        mobility_per_kg,
-        observer,
+        at_once.mobility_per_kg,
+        follow,
         lambda share: progress("latency", 0.7 * share),
     )
     if latency.low_s > 0.0:

@@ -28,15 +28,17 @@ PROMISE_TEXT = """
 For each event, the table shows when `VALID` becomes 0 and when it is 1 again, and the largest error
 of a force with `VALID` = 1. A node on the bus decodes the bridge's frames with cantools; neither
 the log nor internal values of the bridge are used. The bench is the reference case in simulated
-time, and most events begin 2 s after the start. The test fails if a force with `VALID` = 1 has an
-error of more than three times the largest error of the settled run.
+time, and most events begin 2 s after the start. *The settled run* is the same run without an event.
+The test fails if a force with `VALID` = 1 has an error of more than three times the largest error
+of a valid force in the settled run.
 
 - *First invalid frame* and *valid again* are times since the event; these and the modes are those
   of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent every 100 ms: a
   mode that begins and ends between two of these frames is not listed.
-- *Then acknowledged*: the safe state is acknowledged 0.9 s after the event, and again every second.
+- *Then acknowledged*: the safe state is acknowledged 0.8 to 0.9 s after the event, and again every
+  second.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
-  published gains / a damped PI observer / the noise-aware observer.
+  published gains / a damped PI observer / the noise-aware observer; a dash: no force was valid.
 - In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the
   operating system, with a virtual bus in a separate network namespace; only `VALID` is decoded.
 - The last column states what the bench itself has to do.

@@ -1,5 +1,6 @@
 """The table of faults, filled by the tests: `pytest tests/faults -n 0 --fault-table FILE`."""
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -82,7 +83,10 @@ def promises(request: pytest.FixtureRequest) -> Iterator[list[tuple[int, tuple[s
 
 @pytest.fixture
 def promise(promises: list[tuple[int, tuple[str, ...]]]) -> Callable[..., None]:
-    """Adds a row; times are those of the noise-aware observer, errors those of all."""
+    """Adds a row; times are those of the noise-aware observer, errors those of all.
+
+    An error is NaN where no force was valid.
+    """
 
     def add(
         order: int,
@@ -93,7 +97,7 @@ def promise(promises: list[tuple[int, tuple[str, ...]]]) -> Callable[..., None]:
         ratios: dict[str, float],
         duty: str,
     ) -> None:
-        errors = " / ".join(f"{ratio:.2f}" for ratio in ratios.values())
+        errors = " / ".join(f"{it:.2f}" if not math.isnan(it) else "–" for it in ratios.values())
         promises.append((order, (event, ", ".join(modes), within, again, errors, duty)))
 
     return add

@@ -12,7 +12,8 @@ import pytest
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
-ALONE = "without a watchdog, detect that the frames stop"
+STOP = "do not use the force while VALID is 0"
+ALONE = f"detect that the frames stop; {STOP}"
 SIGNALS = ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGHUP", "SIGINT")
 
 
@@ -56,7 +57,7 @@ def test_how_soon(ends, promise):
     in_order_s = max(ends[name]["first_invalid_s"] for name in ("SIGTERM", "SIGHUP", "SIGINT"))
     for order, (words, within_s, duty) in enumerate(
         (
-            ("Ctrl-C, SIGTERM, a closed terminal", in_order_s, "nothing"),
+            ("Ctrl-C, SIGTERM, a closed terminal", in_order_s, STOP),
             ("SIGKILL of the bridge, with its watchdog", ends["SIGKILL"]["first_invalid_s"], ALONE),
             ("SIGSTOP of the bridge, with its watchdog", ends["SIGSTOP"]["first_invalid_s"], ALONE),
         ),

@@ -16,6 +16,7 @@ from rig.plan.load import load_plan, plan_of_run
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
+from rig.tuning.expectation import FollowedStretch, part_by_late_force
 from rig.tuning.gains import Aim
 from rig.tuning.tune import StatedExpectation, tune, write_config
 
@@ -24,7 +25,7 @@ NOISE_M = 20e-6
 SINES = ((60.0, 8.0), (50.0, 19.3), (40.0, 37.7))
 
 
-def bench(folder, latency_ns=0, sines=SINES):
+def bench(folder, latency_ns=0, sines=SINES, force_latency_ns=0):
     """A run of 8 s, from a bench with a noisy height of coarse steps that comes late."""
     dbc = DEFAULT_DATABASE.read_text("utf-8")
     fine = "SG_ HEIGHT : 12|20@1- (2E-006,0) [-1.048576|1.048574]"
@@ -35,7 +36,11 @@ def bench(folder, latency_ns=0, sines=SINES):
     height = {"signal": "HEIGHT", "strut": "strut", "noise_std_m": NOISE_M}
     content["transmissions"] = [
         {"message": "BENCH_MEASUREMENT", "latency_ns": latency_ns, "height": height},
-        {"message": "BENCH_MEASUREMENT_2", "applied_force": {"signal": "APPLIED_FORCE"}},
+        {
+            "message": "BENCH_MEASUREMENT_2",
+            "latency_ns": force_latency_ns,
+            "applied_force": {"signal": "APPLIED_FORCE"},
+        },
     ]
     content["applied_force"]["components"] = [
         {"kind": "sine", "amplitude_n": n, "angular_frequency_rad_per_s": w} for n, w in sines
@@ -92,6 +97,29 @@ def test_noise_latency_and_gains_come_from_a_run(late):
         write_config(ready, [found], path)
     with pytest.raises(InputError, match="expected a file in the folder of"):
         write_config(ready, [found], late / "run" / "tuned.yaml")
+
+
+def test_an_applied_force_that_arrives_late_is_reported(tmp_path, capsys, monkeypatch):
+    folder = bench(tmp_path, force_latency_ns=4_000_000)
+    _, found = tuned(folder)
+    assert found.delay_s == 0.0
+    assert found.latency.delay_s == pytest.approx(-4e-3, abs=4e-4)
+    assert rig(monkeypatch, "tune", folder / "rig.yaml", "--run", folder / "run") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "The applied force arrives" in shown
+    assert "ms later than the height" in shown
+
+
+def test_a_late_force_leaves_its_rate_in_the_residual_force():
+    t_s, late_s = np.arange(0.0, 5.0, 1e-3), 2e-3
+    applied_n = 100.0 * np.sin(8.0 * np.pi * t_s)
+    other_n = 30.0 * np.sin(18.0 * np.pi * t_s)
+    residual_n = applied_n - 100.0 * np.sin(8.0 * np.pi * (t_s - late_s)) + other_n
+    nothing = np.zeros_like(t_s)
+    stretch = FollowedStretch(t_s, nothing, t_s, nothing, nothing, nothing, applied_n)
+    part_n = part_by_late_force(stretch, residual_n)
+    assert part_n == pytest.approx(late_s * 100.0 * 8.0 * np.pi / 2**0.5, rel=0.02)
+    assert part_by_late_force(stretch._replace(applied_n=nothing), residual_n) == 0.0
 
 
 def test_one_sine_does_not_tell_the_latency(tmp_path):

@@ -360,8 +360,7 @@ def _list_rejections(
         law = screening.laws[-1]
         if law in chosen_laws or law in rejected:
             continue
-        nothing = first_round.nothing.cost
-        residual = float(np.sqrt(max(screening.cost, 0.0) / max(nothing, 1e-300)))
+        residual = float(np.sqrt(max(screening.share, 0.0)))
         why = (
             "these data cannot distinguish it from the chosen model"
             if law in tied

@@ -107,12 +107,14 @@ class Screening(NamedTuple):
         values: Parameters of each; for a law that depends on the strut's free length, followed by
             the change of that against the reference.
         block_costs: Out-of-sample sum of squares of each block; `cost` where nothing was refined.
+        share: Sum of squares as a share of that without any law, of the same samples.
     """
 
     laws: tuple[StrutEffect, ...]
     values: tuple[Array, ...]
     cost: float
     block_costs: Array
+    share: float = 1.0
 
     @property
     def validation_cost(self) -> float:
@@ -382,13 +384,24 @@ def rank_laws(
         jobs = [(at, values) for at, best in list(general) for _, values in best]
         coarse = best_of_each([*coarse, *pool.map(this.refine_coarsely, jobs)])
         fine = [s for s in pool.map(this.refine, coarse[:_FINE]) if s is not None]
+    nothing, coarse_nothing = (
+        max(float(target @ target), 1e-300) for target in (stage.target, this.coarse.target)
+    )
+    fine = [s._replace(share=s.cost / nothing) for s in fine]
     # Coarse costs in terms of fine ones, for laws that are not refined there.
     scale = len(stage.target) / len(this.coarse.target)
     fine += [
-        s._replace(cost=scale * s.cost, block_costs=scale * s.block_costs) for s in coarse[_FINE:]
+        Screening(s.laws, s.values, scale * s.cost, scale * s.block_costs, s.cost / coarse_nothing)
+        for s in coarse[_FINE:]
     ]
     rest = [
-        Screening((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
+        Screening(
+            (*base.laws, laws[i]),
+            (),
+            scale * cost,
+            np.array([scale * cost]),
+            cost / coarse_nothing,
+        )
         for cost, i in order[screened:]
     ]
     return [*sorted(fine, key=lambda screening: screening.validation_cost), *rest]
