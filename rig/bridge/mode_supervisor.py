@@ -28,6 +28,7 @@ from rig.bridge.supervision_limits import (
     Excess,
     Limit,
     LimitsByStrut,
+    excess_of,
     find_excess,
     find_violations,
     inherit_delays,
@@ -375,16 +376,15 @@ class Supervisor:
             values = values_with_history(struts, history)
         limits = self._limits if is_settled else self._limits_before
         action = max(map(worst_action, limits, values), default=0)
+        excess = find_excess(limits, values, action) if action else None
         if self.delayed:
             delays = update_delays(self.delayed, state.delays, values, t_ns)
             state = replace(state, delays=delays)
             passed = find_violations(self.delayed, delays, is_settled=is_settled)
-            action = max([action, *(row.severity for _, row in passed)])
-            limits = [
-                [*rows, *(row for strut, row in passed if strut == index)]
-                for index, rows in enumerate(limits)
-            ]
-        return state, action, find_excess(limits, values, action) if action else None
+            for strut, row in passed:
+                if row.severity > action:
+                    action, excess = row.severity, excess_of(row, strut, values[strut][row.value])
+        return state, action, excess
 
     def end(self, state: SupervisedState) -> StepOutput:
         """What is published when the run ends: the safe output, whatever the mode was."""

@@ -341,9 +341,14 @@ def _first_excess(
     for limit in limits:
         number = values[limit.value]
         if limit.action_at(number) == action:
-            bound, channel = limit.bound_beyond(number), limit.channel or ""
-            return Excess(strut, limit.value, number, bound, channel)
+            return excess_of(limit, strut, number)
     return None
+
+
+def excess_of(limit: Limit, strut: int, number: float) -> Excess:
+    """What counts as beyond a limit; the value itself may be within it again."""
+    bound, channel = limit.bound_beyond(number), limit.channel or ""
+    return Excess(strut, limit.value, number, bound, channel)
 
 
 def worst_action(limits: Sequence[Limit], values: EstimateValues) -> int:

@@ -77,7 +77,7 @@ def _print(rows: "Sequence[tuple[str, RunEvaluation]]", gaps: "Mapping[str, Gaps
 
 
 def _print_run(name: str, rows: "list[tuple[str, RunEvaluation]]") -> None:
-    from rig.pages.report.number_formats import quantity
+    from rig.pages.number_formats import quantity
 
     floor = "noise floor"
     is_prescribed = any(isnan(row.figures.height_rmse_m.after) for _, row in rows)

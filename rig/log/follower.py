@@ -31,6 +31,14 @@ FLAGS = {
 }
 """Columns that the bits of `flags` become: of a sum of bits the largest says little."""
 
+FORCE_ERROR = "force_error_n"
+"""Column of the estimated force less that of the load cell, where the model has one strut; NaN in
+cycles without a sample or a valid estimate. Extremes of two curves would not give those of their
+difference."""
+
+_CELL, _FORCE = "strut_force_n", ".force_n"
+"""Column of the load cell, and end of the name of that of a strut's estimate."""
+
 _NEWEST = 131_072
 """Steps that are kept whole: two minutes at 1 kHz, in some ten megabytes."""
 
@@ -98,6 +106,11 @@ class RunFollower:
             return 0.0, 0.0
         first = self._least.rows[0, 0] if len(self._least.rows) else self._open[0, 0]
         return float(first) * 1e-9, float(self._newest[-1][-1, 0]) * 1e-9
+
+    @property
+    def newest(self) -> Array | None:
+        """The newest step, shape (columns,); None before there is one."""
+        return self._newest[-1][-1] if self._newest else None
 
     def update(self, most_steps: int) -> None:
         """Take about so many steps of what was written since; the rest is for the next call."""
@@ -195,7 +208,7 @@ class RunFollower:
 
     def _add(self, rows: Array) -> None:
         if not self.columns:
-            self.columns = (*self._schema.names, *FLAGS)
+            self.columns = (*self._schema.names, *FLAGS, FORCE_ERROR)
             self._open = rows[:0]
         self.steps += len(rows)
         if self._newest and len(self._newest[-1]) < _PIECE:
@@ -252,7 +265,17 @@ def _matrix(table: pa.Table) -> Array:
     columns = [np.asarray(column.to_numpy(), np.float64) for column in table.columns]
     flags = table.column("flags").to_numpy()
     bits = [(flags & bit > 0).astype(np.float64) for bit in FLAGS.values()]
-    return np.column_stack([*columns, *bits])
+    return np.column_stack([*columns, *bits, _force_error(table.schema.names, columns)])
+
+
+def _force_error(names: Sequence[str], columns: Sequence[Array]) -> Array:
+    struts = [name.removesuffix(_FORCE) for name in names if name.endswith(_FORCE)]
+    if len(struts) != 1 or _CELL not in names:
+        return np.full(len(columns[0]), np.nan)
+    force, valid, cell = (
+        columns[names.index(name)] for name in (struts[0] + _FORCE, f"{struts[0]}.valid", _CELL)
+    )
+    return np.where(valid == 1.0, force - cell, np.nan)
 
 
 def _select_columns(rows: Array, columns: Sequence[int]) -> Array:

@@ -2,12 +2,13 @@
 
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, cast
 
 from rig.bridge.values import Mode
 from rig.log.file_names import EVENTS_FILE
+from rig.pages.mode_words import TONES, LoggedEvent, describe_cause
 
 _PIECES = 1000
 """Pieces of the band: the severest mode of each is drawn, so that none is too short to be seen."""
@@ -16,13 +17,6 @@ _MOST_LISTED = 200
 """Events in the table; a mode that flutters fills no page."""
 
 _SEVERITY = (Mode.RUNNING, Mode.READY, Mode.SETTLING, Mode.INIT, Mode.WAITING, Mode.HOLD, Mode.SAFE)
-_TONES = {
-    Mode.RUNNING: "good",
-    Mode.READY: "part",
-    Mode.SETTLING: "part",
-    Mode.HOLD: "bad",
-    Mode.SAFE: "bad",
-}
 
 
 class BandPiece(NamedTuple):
@@ -42,17 +36,16 @@ class ListedEvent(NamedTuple):
     why: str
 
 
-Event = Mapping[str, object]
-"""A line of `EVENTS_FILE`."""
-
-
-def read_events(folder: Path) -> list[Event]:
+def read_events(folder: Path) -> list[LoggedEvent]:
     """Events of a run, in their order; what cannot be read of its file is left out."""
     path = folder / EVENTS_FILE
-    events: list[Event] = []
-    if not path.exists():
-        return events
-    for line in path.read_text("utf-8", errors="replace").splitlines():
+    return parse_events(path.read_bytes()) if path.exists() else []
+
+
+def parse_events(lines: bytes) -> list[LoggedEvent]:
+    """Events in lines of their file; what cannot be read is left out."""
+    events: list[LoggedEvent] = []
+    for line in lines.decode("utf-8", errors="replace").splitlines():
         try:
             event = json.loads(line)
             if isinstance(event["t_s"], int | float):
@@ -62,7 +55,7 @@ def read_events(folder: Path) -> list[Event]:
     return events
 
 
-def make_band(events: Sequence[Event], begin_s: float, end_s: float) -> list[BandPiece]:
+def make_band(events: Sequence[LoggedEvent], begin_s: float, end_s: float) -> list[BandPiece]:
     """The modes between two times, stretch by stretch."""
     changes = [
         (float(str(event["t_s"])), Mode[str(event["to"])])
@@ -83,13 +76,13 @@ def make_band(events: Sequence[Event], begin_s: float, end_s: float) -> list[Ban
     for severity, group in itertools.groupby(pieces):
         length = len(list(group))
         mode = _SEVERITY[max(severity, 0)]
-        tone = _TONES.get(mode, "idle")
+        tone = TONES[mode].name
         stretches.append(BandPiece(mode.name, tone, begin * share, length * share))
         begin += length
     return stretches
 
 
-def list_events(events: Sequence[Event]) -> tuple[list[ListedEvent], int]:
+def list_events(events: Sequence[LoggedEvent]) -> tuple[list[ListedEvent], int]:
     """The first events of a run in words, and how many more there are."""
     listed = [_in_words(event) for event in events[:_MOST_LISTED]]
     return listed, max(0, len(events) - _MOST_LISTED)
@@ -100,7 +93,7 @@ def _piece_at(t_s: float, begin_s: float, end_s: float) -> int:
     return min(max(int(share * _PIECES), 0), _PIECES - 1)
 
 
-def _in_words(event: Event) -> ListedEvent:
+def _in_words(event: LoggedEvent) -> ListedEvent:
     t_s = float(str(event["t_s"]))
     if "request" in event:
         refused = ", refused" if event.get("refused") else ""
@@ -112,18 +105,8 @@ def _in_words(event: Event) -> ListedEvent:
     return ListedEvent(t_s, str(event.get("machine", "")).replace("_", " "), why)
 
 
-def _cause_in_words(event: Event) -> str:
-    parts = [str(event.get("cause") or "").replace("_", " ")]
-    if "quantity" in event:
-        value, limit = (_number(event.get(key)) for key in ("value", "limit"))
-        parts.append(f"{event['quantity']} {value}" + (f" (limit {limit})" if limit else ""))
-    parts += [f"{key} {event[key]}" for key in ("strut", "device") if key in event]
-    first = event.get("first_cause")
+def _cause_in_words(event: LoggedEvent) -> str:
+    words, first = describe_cause(event), event.get("first_cause")
     if isinstance(first, dict):
-        cause = str(cast("Event", first).get("cause") or "").replace("_", " ")
-        parts.append(f"first cause: {cause}")
-    return ", ".join(part for part in parts if part)
-
-
-def _number(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else str(value or "")
+        words += f"; at first: {describe_cause(cast('LoggedEvent', first))}"
+    return words

@@ -7,7 +7,7 @@ kind of each curve from here.
 from enum import StrEnum
 from typing import NamedTuple
 
-from rig.bridge.values import Mode
+from rig.log.follower import FORCE_ERROR
 
 
 class PlottedQuantity(NamedTuple):
@@ -15,42 +15,51 @@ class PlottedQuantity(NamedTuple):
 
     Attributes:
         name: Its name.
-        unit: Its SI unit, in which the log holds it and the live page shows it.
-        report_unit: Its unit in a report.
-        report_factor: Value in `report_unit` over the value in `unit`.
+        unit: Its SI unit, in which the log holds it.
+        shown_unit: The unit in which pages and reports show it.
+        factor: Value in `shown_unit` over the value in `unit`.
+        least_span: Shortest axis in `unit`: noise of a signal at rest fills no chart.
     """
 
     name: str
     unit: str
-    report_unit: str
-    report_factor: float = 1.0
+    shown_unit: str
+    factor: float = 1.0
+    least_span: float = 0.0
 
     @property
     def label(self) -> str:
-        """Label of its axis on the live page."""
-        return _label(self.name, self.unit)
-
-    @property
-    def report_label(self) -> str:
-        """Label of its axis in a report."""
-        return _label(self.name, self.report_unit)
-
-
-def _label(name: str, unit: str) -> str:
-    return f"{name} / {f'({unit})' if '/' in unit else unit}"
+        """Label of its axis."""
+        unit = self.shown_unit
+        return f"{self.name} / {f'({unit})' if '/' in unit else unit}"
 
 
 TIME = PlottedQuantity("time", "s", "s")
 FREQUENCY = PlottedQuantity("frequency", "Hz", "Hz")
-HEIGHT = PlottedQuantity("height", "m", "mm", 1e3)
-VELOCITY = PlottedQuantity("velocity", "m/s", "m/s")
-FORCE = PlottedQuantity("force", "N", "N")
-STRUT_FORCE = PlottedQuantity("strut force", "N", "N")
-VIRTUAL_FORCE = PlottedQuantity("virtual force", "N", "N")
+HEIGHT = PlottedQuantity("height", "m", "mm", 1e3, 1e-3)
+HEIGHT_ERROR = PlottedQuantity("height error (innovation)", "m", "mm", 1e3, 2e-5)
+VELOCITY = PlottedQuantity("velocity", "m/s", "m/s", 1.0, 1e-2)
+FORCE = PlottedQuantity("force", "N", "N", 1.0, 2.0)
+STRUT_FORCE = PlottedQuantity("strut force", "N", "N", 1.0, 2.0)
+FORCE_DIFFERENCE = PlottedQuantity("force error", "N", "N", 1.0, 2.0)
+VIRTUAL_FORCE = PlottedQuantity("virtual force", "N", "N", 1.0, 2.0)
 RESIDUAL_FORCE = PlottedQuantity("residual force", "N", "N")
 RESIDUAL_DENSITY = PlottedQuantity("residual force", "N/√Hz", "N/√Hz")
-INNOVATION = PlottedQuantity("innovation", "m", "mm", 1e3)
 TICK_TIME = PlottedQuantity("time", "µs", "µs")
+
+UNITS: dict[str, dict[str, tuple[float, str]]] = {
+    "SI": {"m": (1e3, "mm")},
+    "US": {
+        "m": (1.0 / 0.0254, "in"),
+        "m/s": (1.0 / 0.0254, "in/s"),
+        "N": (1.0 / 4.4482216152605, "lbf"),
+        "N/√Hz": (1.0 / 4.4482216152605, "lbf/√Hz"),
+    },
+}
+"""Units that the live page can show, by SI unit: factor and name; others are shown as they are.
+
+An inch is 0.0254 m and a pound-force 4.4482216152605 N by definition.
+"""
 
 
 class Origin(StrEnum):
@@ -62,7 +71,10 @@ class Origin(StrEnum):
     """By model and virtual force together."""
 
     OBSERVER = "observer"
-    """Input or output of the observer."""
+    """Output of the observer."""
+
+    ERROR = "error"
+    """Difference of two of them."""
 
 
 class LoggedCurve(NamedTuple):
@@ -92,16 +104,17 @@ class TimePlot(NamedTuple):
     Attributes:
         key: Its key on the live page.
         title: Its heading there.
-        quantity: Its ordinate in a report.
-        live_quantity: Its ordinate on the live page, where the heading names the force.
+        quantity: Its ordinate.
         curves: Its curves, the one behind the others first.
+        is_strip: Whether it shows the difference of the curves of the plot before it, in a low
+            strip below them.
     """
 
     key: str
     title: str
     quantity: PlottedQuantity
-    live_quantity: PlottedQuantity
     curves: tuple[LoggedCurve, ...]
+    is_strip: bool = False
 
 
 MEASURED_HEIGHT = LoggedCurve("measured_height_m", "measured", Origin.MEASURED)
@@ -109,27 +122,26 @@ MODEL_HEIGHT = LoggedCurve("height_m", "model", Origin.MODEL)
 LOAD_CELL = LoggedCurve("strut_force_n", "load cell", Origin.MEASURED, is_of_strut=False)
 ESTIMATED_FORCE = LoggedCurve("force_n", "estimated", Origin.ESTIMATED)
 VIRTUAL_FORCE_CURVE = LoggedCurve("virtual_force_n", "virtual force", Origin.OBSERVER)
-INNOVATION_CURVE = LoggedCurve("innovation_m", "innovation", Origin.OBSERVER)
+HEIGHT_ERROR_CURVE = LoggedCurve("innovation_m", "measured less predicted", Origin.ERROR)
+FORCE_ERROR_CURVE = LoggedCurve(
+    FORCE_ERROR, "estimated less load cell", Origin.ERROR, is_of_strut=False
+)
 
 TIME_PLOTS = (
-    TimePlot("height", "Height", HEIGHT, HEIGHT, (MEASURED_HEIGHT, MODEL_HEIGHT)),
-    TimePlot("force", "Strut force", STRUT_FORCE, FORCE, (LOAD_CELL, ESTIMATED_FORCE)),
-    TimePlot("virtual", "Virtual force", VIRTUAL_FORCE, FORCE, (VIRTUAL_FORCE_CURVE,)),
-    TimePlot("innovation", "Innovation", INNOVATION, INNOVATION, (INNOVATION_CURVE,)),
+    TimePlot("height", "Height", HEIGHT, (MEASURED_HEIGHT, MODEL_HEIGHT)),
+    TimePlot("innovation", "Height error (innovation)", HEIGHT_ERROR, (HEIGHT_ERROR_CURVE,), True),
+    TimePlot("force", "Strut force", STRUT_FORCE, (LOAD_CELL, ESTIMATED_FORCE)),
+    TimePlot("force-error", "Force error", FORCE_DIFFERENCE, (FORCE_ERROR_CURVE,), True),
 )
+
+VIRTUAL_FORCE_PLOT = TimePlot("virtual", "Virtual force", VIRTUAL_FORCE, (VIRTUAL_FORCE_CURVE,))
 
 MOTION_COLUMNS = {"velocity_m_per_s": VELOCITY, "height_m": HEIGHT}
 """Columns of a strut over which the live page plots its force."""
 
 MODE_COLUMN = "mode"
-FAULT_COLUMNS = {"overruns": "missed ticks", "log_fault": "log fault", "bus_fault": "bus fault"}
-"""Columns that mark a fault where they are above zero: their labels, the lowest level first."""
-
-STATE_LEVELS = (*FAULT_COLUMNS.values(), *(mode.name for mode in Mode if mode is not Mode.INIT))
-"""Levels of the plot of state and faults, from 0 upwards."""
-
-FIRST_MODE_LEVEL = len(FAULT_COLUMNS) - Mode.WAITING
-"""Level of a mode less its number."""
+FAULT_COLUMNS = {"overruns": "cycles missed", "log_fault": "log fault", "bus_fault": "bus fault"}
+"""Columns that mark a fault where they are above zero, with their labels."""
 
 TICK_CURVES = ("lateness", "work")
 """Histograms of a run's ticks, by their names in its timing record."""

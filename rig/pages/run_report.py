@@ -12,7 +12,13 @@ from rig.log.follower import RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
 from rig.pages.mode_band import list_events, make_band, read_events
-from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
+from rig.pages.plotted_quantities import (
+    TICK_CURVES,
+    TICK_TIME,
+    TIME,
+    TIME_PLOTS,
+    Origin,
+)
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
 from rig.run.changed_settings import read_changes
 from rig.run.timing import read_histograms
@@ -26,7 +32,8 @@ _STYLES = {
     Origin.MEASURED: ("--measured", 2.4),
     Origin.MODEL: ("--after", 1.2),
     Origin.ESTIMATED: ("--after", 1.2),
-    Origin.OBSERVER: ("--before", 1.2),
+    Origin.OBSERVER: ("--virtual", 1.2),
+    Origin.ERROR: ("--error", 1.2),
 }
 """Colour and width in px of a line, by where its values come from."""
 
@@ -161,8 +168,8 @@ def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> l
             if curve.is_of_strut or (is_only and np.isfinite(column).any()):
                 colour, width = _STYLES[curve.origin]
                 styles.append(LineStyle(curve.label, colour, (), width))
-                curves.append(column * item.quantity.report_factor)
-        labels = TIME.report_label, item.quantity.report_label
+                curves.append(column * item.quantity.factor)
+        labels = TIME.label, item.quantity.label
         panels.append(Panel("lines", *labels, window.t_s, styles, curves, {"gaps": True}))
     caption = (
         "Thinned by minimum and maximum: no peak is lost. The virtual force is what the model "
@@ -180,6 +187,6 @@ def _timing_plot(folder: Path) -> Plot | None:
     styles = [LineStyle(*line, (), 1.4) for line in zip(TICK_CURVES, _TICK_COLOURS, strict=True)]
     shown = [np.where(count > 0, count, np.nan) for count in counts]
     options = {"log": True, "steps": True}
-    panel = Panel("lines", TICK_TIME.report_label, "ticks", edges_us, styles, shown, options)
+    panel = Panel("lines", TICK_TIME.label, "ticks", edges_us, styles, shown, options)
     caption = "Ticks by lateness of their wake-up and by the time of their work."
     return plot("timing", "Timing", caption, [panel], 1)

@@ -30,8 +30,8 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
+from rig.pages.number_formats import label, quantity, value_and_interval
 from rig.pages.report import page, sentence, write_report
-from rig.pages.report.number_formats import label, quantity, value_and_interval
 from rig.pages.report.series import cloud, envelope, spectrum, surface
 from rig.pages.report.words import BLOCKS
 

@@ -9,10 +9,13 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from rig.log.reader import read_run
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
 from rig.run.changed_settings import read_changes
@@ -20,6 +23,7 @@ from rig.run.replay import replay
 from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
 from tests.view.serving import COUNT, make_run, serving
+from tests.view.states import make_state, touch
 
 pytestmark = needs_chromium
 
@@ -57,9 +61,10 @@ def opened(made, run):
 def test_a_finished_run_is_shown_whole(opened):
     assert in_sight(opened) == pytest.approx((0.0, END_S), abs=2e-3)
     assert opened.title().startswith("reference")
-    assert opened.locator(".pill").inner_text() == "done"
-    for heading in ("Height", "Strut force", "Virtual force", "Innovation", "State and faults"):
-        assert opened.get_by_role("heading", name=heading, exact=True).is_visible()
+    assert opened.locator(".pill").inner_text() == "ended"
+    assert opened.locator(".banner .word").inner_text() == "ENDED"
+    for heading in ("Height", "Strut force", "Virtual force", "Height error (innovation)"):
+        assert opened.get_by_role("heading", name=heading, exact=True).first.is_visible()
     until(opened, "document.querySelectorAll('#figures dt').length > 1")
     points = opened.evaluate("charts['plane-height'].chart.data[1][0].length")
     assert points > 50
@@ -93,7 +98,7 @@ def test_the_keyboard_reaches_everything(opened):
     opened.keyboard.press("End")
     assert opened.locator("#pause").get_attribute("aria-pressed") == "false"
     reached = set()
-    for _ in range(12):
+    for _ in range(16):
         opened.keyboard.press("Tab")
         reached.add(opened.evaluate("document.activeElement.id"))
     assert {
@@ -105,6 +110,9 @@ def test_the_keyboard_reaches_everything(opened):
         "wider",
         "whole",
         "newest",
+        "reference",
+        "link",
+        "units",
         "theme",
     } <= reached
 
@@ -112,18 +120,25 @@ def test_the_keyboard_reaches_everything(opened):
 def test_values_stand_under_the_cursor_with_their_units(opened):
     box = opened.locator("#height .u-over").bounding_box()
     opened.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 40)
-    values = opened.locator("#height .u-value")
-    until(opened, "document.querySelectorAll('#height .u-value')[1].textContent.includes(' m')")
-    assert re.fullmatch(r"0\.\d+ s", values.nth(0).inner_text())
+    values = opened.locator('[data-chart="height"] .u-value')
+    until(opened, "charts.height.chart.cursor.idx !== null")
+    assert re.fullmatch(r"[\d.]+ mm", values.nth(1).inner_text())
     # The cursors of the charts over time stand at one time.
-    assert re.fullmatch(r"-?[\d.]+ N", opened.locator("#force .u-value").nth(2).inner_text())
+    forces = opened.locator('[data-chart="force"] .u-value')
+    assert re.fullmatch(r"−?[\d.]+ N", forces.last.inner_text())
 
 
 def test_runs_are_laid_over_one_another(made, server):
     with page(made, server) as opened:
         drawn(opened)
         assert opened.locator(".run").count() == 2
+        assert opened.locator(".banner").count() == 2
         assert opened.evaluate("charts.virtual.chart.series.length") == 3
+        # Each curve has its own look: measured ones are dashed, and each run has its colour.
+        looks = opened.evaluate(
+            "charts.height.chart.series.slice(1).map((s) => [s.stroke(), String(s.dash)].join())"
+        )
+        assert len(set(looks)) == len(looks) == 4
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -157,6 +172,185 @@ def test_reports_keep_nobody_out(made, run, tmp_path, kind, width):
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert errors == []
     opened.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["waiting", "safe_innovation"])
+def test_a_live_page_keeps_nobody_out(made, states, scheme, name):
+    with (
+        serving(states[name], token="secret") as one,
+        page(made, one, scheme=scheme, path="#secret") as opened,
+    ):
+        shown_live(opened, states[name])
+        found = axe.Axe().run(opened).response["violations"]
+        serious = [item for item in found if item["impact"] in ("serious", "critical")]
+        assert serious == [], [(item["id"], item["nodes"][0]["html"]) for item in serious]
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory):
+    """Runs as they look while they are recorded."""
+    folder = tmp_path_factory.mktemp("states")
+    names = ("running", "waiting", "hold", "safe_silent", "safe_innovation", "ready")
+    return {name: make_state(folder / name, name) for name in names}
+
+
+def shown_live(opened, run):
+    """Wait until the page shows a run that is being recorded."""
+    for _ in range(200):
+        touch(run)
+        if opened.evaluate("runs[0]?.state === 'live' && Boolean(document.body.dataset.frames)"):
+            return
+        opened.wait_for_timeout(50)
+    pytest.fail("not shown as live")
+
+
+BANNERS = {
+    "running": ("RUNNING", r"since 0\.1 s\. Force output valid\.", None),
+    "waiting": ("WAITING", r"for BENCH_MEASUREMENT on rig, 5 s\. .*invalid\.", None),
+    "hold": ("HOLD", r"since 4\.0 s: no valid measurement for 11 ms \(limit 10 ms\)\. .*", None),
+    "safe_silent": (
+        "SAFE",
+        r"since 4\.5 s: no valid measurement for 501 ms \(limit 500 ms\)\. .*",
+        "Acknowledge",
+    ),
+    "safe_innovation": (
+        "SAFE",
+        r"since 1\.2 s: height error \(innovation\) 0\.101 mm \(limit 0\.1 mm\)\. .*",
+        "Acknowledge",
+    ),
+    "ready": ("READY", r"since 0\.1 s: settled, and withheld until armed\. .*", "Arm"),
+}
+
+
+@pytest.mark.parametrize("name", BANNERS)
+def test_the_banner_states_mode_cause_and_action(made, states, name):
+    word, text, action = BANNERS[name]
+    with (
+        serving(states[name], token="secret") as one,
+        page(made, one, width=1600, height=1000, path="#secret") as opened,
+    ):
+        shown_live(opened, states[name])
+        assert opened.locator(".banner .word").inner_text() == word
+        assert re.fullmatch(text, opened.locator(".banner .text").inner_text().replace("\xa0", " "))
+        buttons = opened.locator(".banner button")
+        assert buttons.all_inner_texts() == ([action] if action else [])
+        # All that decides is in sight without scrolling.
+        for item in (".banner", "#tile-force-error", '[data-chart="band"]'):
+            box = opened.locator(item).first.bounding_box()
+            assert box["y"] + box["height"] <= 1000
+        force = opened.locator("#tile-force .sub").inner_text()
+        assert (force == "invalid") == (name != "running")
+
+
+def test_tiles_hold_what_the_log_holds(made, states):
+    steps = read_run(states["running"]).steps
+    last = {name: steps.column(name).to_numpy() for name in steps.schema.names}
+    error_n = (last["strut.force_n"] - last["strut_force_n"])[last["t_ns"] > last["t_ns"][-1] - 1e9]
+    error_n = error_n[np.isfinite(error_n)]
+    with serving(states["running"]) as one, page(made, one) as opened:
+        shown_live(opened, states["running"])
+        big = {it: opened.locator(f"#tile-{it} .big").inner_text() for it in ("height", "force")}
+        height_m = last["strut.measured_height_m"]
+        height_m = height_m[np.isfinite(height_m)][-1]
+        assert big["height"] == f"{1e3 * height_m:.2f} mm"
+        assert big["force"] == f"{last['strut.force_n'][-1]:.1f} N".replace("-", "−")
+        rms_n = float(np.sqrt(np.mean(error_n**2)))
+        assert opened.locator("#tile-force-error .big").inner_text() == f"{rms_n:.1f} N"
+        opened.select_option("#units", "US")
+        until(opened, "document.querySelector('#tile-height .big').textContent.includes('in')")
+        shown = opened.locator("#tile-height .big").inner_text()
+        assert float(shown.removesuffix(" in")) == pytest.approx(height_m / 0.0254, abs=1e-4)
+
+
+def test_tabs_are_reached_by_keyboard(opened):
+    opened.locator("#of-tab-virtual").focus()
+    opened.keyboard.press("ArrowRight")
+    assert opened.evaluate("document.activeElement.id") == "of-tab-spectrum"
+    assert opened.locator("#tab-spectrum").is_visible()
+    assert not opened.locator("#tab-virtual").is_visible()
+    opened.keyboard.press("End")
+    assert opened.locator("#tab-diagnosis").is_visible()
+    opened.keyboard.press("Home")
+    assert opened.locator("#tab-virtual").is_visible()
+
+
+def test_a_chart_is_saved_as_picture_and_as_numbers(opened, run):
+    figure = opened.locator('[data-chart="force"]')
+    figure.locator("summary").click()
+    with opened.expect_download() as saved:
+        figure.get_by_role("button", name="PNG").click()
+    assert saved.value.suggested_filename == "reference-force.png"
+    assert Path(saved.value.path()).read_bytes().startswith(b"\x89PNG")
+    figure.locator("summary").click()
+    with opened.expect_download() as saved:
+        figure.get_by_role("button", name="CSV").click()
+    found = np.genfromtxt(saved.value.path(), delimiter=",", names=True)
+    steps = read_run(run).steps
+    assert len(found) == steps.num_rows
+    expected = steps.column("strut.force_n").to_numpy()
+    assert np.allclose(found["strutforce_n"], expected, rtol=1e-8, equal_nan=True)
+
+
+def test_a_second_cursor_shows_differences(opened):
+    box = opened.locator("#height .u-over").bounding_box()
+    opened.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 40)
+    opened.keyboard.press("m")
+    assert opened.locator("#reference").get_attribute("aria-pressed") == "true"
+    opened.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 40)
+    text = '[data-chart="height"] .u-value'
+    until(opened, f"document.querySelectorAll('{text}')[1].textContent.includes('Δ')")
+    value, base = opened.evaluate(
+        "(() => { const { chart } = charts.height; const at = chart.cursor.idx;"
+        " return [chart.data[1][at], chart.data[1][chart.valToIdx(Charts.reference.x)]]; })()"
+    )
+    shown = opened.locator(text).nth(1).inner_text().replace("−", "-")
+    assert float(shown.split("Δ ")[1].rstrip(")")) == pytest.approx(value - base, abs=2e-2)
+
+
+def test_any_logged_quantity_gets_a_chart_that_stays(made, run):
+    with serving(run) as one, contextlib.closing(made.new_context()) as context:
+        opened = context.new_page()
+        opened.goto(one.address)
+        drawn(opened)
+        opened.locator("#of-tab-more").click()
+        opened.select_option("#quantity", "strut.acceleration_m_per_s2")
+        opened.get_by_role("button", name="Add a chart").click()
+        until(opened, "Boolean(charts['more-0'])")
+        opened.reload()
+        until(opened, "Boolean(charts['more-0']) && charts['more-0'].chart.data[0].length > 100")
+        assert opened.locator("#added h2").inner_text() == "strut.acceleration_m_per_s2"
+        opened.get_by_role("button", name="Remove the chart").click()
+        until(opened, "!charts['more-0']")
+
+
+def test_a_link_holds_what_is_shown(made, run):
+    with serving(run) as one, page(made, one, path="?begin=0.2&end=0.4&strut=strut") as opened:
+        drawn(opened)
+        until(opened, "Math.abs(view.end - 0.4) < 1e-9")
+        assert in_sight(opened) == pytest.approx((0.2, 0.4))
+
+
+def test_an_event_is_shown_by_a_click(made, states):
+    with serving(states["safe_silent"]) as one, page(made, one) as opened:
+        drawn(opened)
+        opened.locator("#of-tab-events").click()
+        until(opened, "document.querySelectorAll('#events button').length > 3")
+        opened.locator("#events button").first.click()
+        until(opened, "view.end - view.begin < 1.1")
+        assert "HOLD → SAFE" in opened.locator("#event").inner_text()
+        assert in_sight(opened) == pytest.approx((4.0, 5.0))
+
+
+def test_a_phone_shows_banner_tiles_and_force_first(made, states):
+    with serving(states["running"]) as one, page(made, one, width=390, height=844) as opened:
+        shown_live(opened, states["running"])
+        items = (".banner", ".tiles", '[data-chart="force"]', '[data-chart="height"]')
+        tops = [opened.locator(item).first.bounding_box()["y"] for item in items]
+        assert tops == sorted(tops)
+        assert not opened.locator("#pause").is_visible()
+        opened.locator("#menu").click()
+        assert opened.locator("#pause").is_visible()
 
 
 def test_a_name_is_never_executed(made, run, tmp_path):
@@ -241,6 +435,7 @@ def test_a_live_run_is_followed(made, tmp_path):
                 )
                 drawn(other, 20)
                 drawn(opened, frames(opened) + 20)
+            opened.locator("#of-tab-control").click()
             opened.select_option("#key", "observers.strut.proportional_n_per_m")
             opened.fill("#value", "-1")
             opened.click("#change button")
@@ -270,6 +465,7 @@ def test_a_button_diagnoses_a_finished_run(made, tmp_path):
     with serving(run, token="secret") as one, page(made, one, path="#secret") as opened:
         drawn(opened)
         until(opened, "!document.getElementById('diagnosis').hidden")
+        opened.locator("#of-tab-diagnosis").click()
         opened.get_by_role("button", name="Diagnose").click()
         until(opened, "!document.getElementById('progress-of').hidden")
         assert opened.get_by_role("button", name="Cancel").is_visible()
@@ -293,6 +489,7 @@ def test_a_button_diagnoses_a_finished_run(made, tmp_path):
     # Whoever may only look sees what was found.
     with serving(run) as one, page(made, one) as opened:
         drawn(opened)
+        opened.locator("#of-tab-diagnosis").click()
         until(opened, "!document.getElementById('report-of').hidden")
         assert not opened.get_by_role("button", name="Diagnose").is_visible()
     with serving(run, token="secret") as one, page(made, one, path="#secret") as opened:

@@ -8,12 +8,20 @@ const Charts = (() => {
       ? getComputedStyle(document.documentElement).getPropertyValue(name).trim()
       : name;
 
-  // Five digits, in the notation that is shorter; NaN and null are nothing.
+  // Numbers as in the reports: a true minus, narrow spaces between thousands, as many decimals as
+  // asked for.
+  const fixed = (value, decimals) => {
+    const [whole, part] = Math.abs(value).toFixed(Math.max(0, decimals)).split(".");
+    const grouped = whole.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (part ? `.${part}` : "");
+    return value < 0 && /[1-9]/.test(grouped) ? `\u2212${grouped}` : grouped;
+  };
+
+  // Five digits; powers of ten far from one. NaN and null are nothing.
   const number = (value) => {
     if (value === null || value === undefined || Number.isNaN(value)) return "–";
     const size = Math.abs(value);
-    if (size !== 0 && (size < 1e-4 || size >= 1e6)) return value.toExponential(3);
-    return value.toPrecision(5);
+    if (size !== 0 && (size < 1e-4 || size >= 1e6)) return value.toExponential(3).replaceAll("-", "\u2212");
+    return fixed(value, size === 0 ? 0 : 4 - Math.floor(Math.log10(size)));
   };
 
   const axis = (label, size, more) => ({
@@ -34,8 +42,19 @@ const Charts = (() => {
     values.map((v) => {
       if (v === null || v === undefined) return "";
       const size = Math.abs(v);
-      return size !== 0 && (size < 1e-3 || size >= 1e5) ? v.toExponential(0) : String(+v.toPrecision(6));
+      const text = size !== 0 && (size < 1e-3 || size >= 1e5) ? v.toExponential(0) : String(+v.toPrecision(6));
+      return text.replaceAll("-", "\u2212");
     });
+
+  // An axis about the values, never shorter than a span: noise at rest fills no chart.
+  const spanning = (least) => (_u, low, high) => {
+    if (low === null || high === null) return [-0.5 * least, 0.5 * least];
+    const half = Math.max(0.54 * (high - low), 0.5 * least);
+    return [0.5 * (low + high) - half, 0.5 * (low + high) + half];
+  };
+
+  // Five decades below the largest value, and some where all are zero.
+  const decades = (_u, low, high) => (high > 1e-9 ? [Math.max(low, high * 1e-5), 2 * high] : [1e-3, 1]);
 
   // A channel that is sampled less often than the ticks has no value at most of them: its line goes
   // on. Where several samples are missing there was none, and the line has a gap.
@@ -61,10 +80,40 @@ const Charts = (() => {
     ...(item.spanGaps ? { gaps: longGaps } : {}),
     points: { show: item.points ?? false, size: 4 },
     paths: item.paths,
-    value: (_u, v) => `${number(v)}${item.unit ? ` ${item.unit}` : ""}`,
+    value(u, given, index, at) {
+      // Without a cursor the legend holds the last values.
+      const v = given === null && !(u.cursor.left >= 0) ? (u.data[index][lastOf(u.data[index])] ?? null) : given;
+      return `${number(v)}${item.unit ? ` ${item.unit}` : ""}${difference(u, v, index, at)}`;
+    },
   });
 
-  const width = (element) => Math.max(200, Math.floor(element.clientWidth));
+  // The second cursor: a time in s, or null. Values at the first one are given with their differences
+  // from those at the second one.
+  const reference = { x: null };
+
+  function difference(u, v, index, at) {
+    if (reference.x === null || u.spec?.sync === undefined || typeof v !== "number" || at === null) return "";
+    const from = u.valToIdx(reference.x);
+    const base = nearest(u.data[index], from);
+    return base === null ? "" : ` (Δ ${number(v - u.data[index][base])})`;
+  }
+
+  // Index of the value next to an index that there is; null without any within a hundred.
+  function nearest(list, from) {
+    for (let by = 0; by < 100; by++) {
+      for (const i of [from - by, from + by]) {
+        if (list[i] !== null && list[i] !== undefined) return i;
+      }
+    }
+    return null;
+  }
+
+  const lastOf = (list) => {
+    for (let i = list.length - 1; i >= 0; i--) if (list[i] !== null && list[i] !== undefined) return i;
+    return null;
+  };
+
+  const width = (element) => Math.max(60, Math.floor(element.clientWidth));
   const height = (element) => parseInt(getComputedStyle(element).getPropertyValue("--height"), 10);
 
   const sizeOf = (element) => ({ width: width(element), height: height(element) });
@@ -104,7 +153,38 @@ const Charts = (() => {
       // A name that would run into the next one says nothing.
       if (ctx.measureText(mark.name).width < end - x - 8) ctx.fillText(mark.name, x + 4, top + 12 * devicePixelRatio);
     }
+    ctx.strokeStyle = colour("--bad");
+    ctx.lineWidth = devicePixelRatio;
+    ctx.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
+    for (const limit of spec.limits ?? []) {
+      const y = u.valToPos(limit, "y", true);
+      if (y >= top && y <= top + high) across(ctx, [left, y], [left + wide, y]);
+    }
+    if (spec.sync !== undefined && reference.x !== null) {
+      const x = u.valToPos(reference.x, "x", true);
+      ctx.strokeStyle = colour("--accent");
+      if (x >= left && x <= left + wide) across(ctx, [x, top], [x, top + high]);
+    }
     ctx.restore();
+  };
+
+  const across = (ctx, from, to) => {
+    ctx.beginPath();
+    ctx.moveTo(...from);
+    ctx.lineTo(...to);
+    ctx.stroke();
+  };
+
+  // Samples of lines are filled, and empty for dashed ones.
+  const markers = { fill: (u, i) => (u.series[i].dash ? "transparent" : u.series[i].stroke(u, i)), width: 2 };
+
+  // A figure of one chart, whose head has a place for the legend.
+  const figureOf = (element) => element.closest(".figure[data-chart]");
+
+  const placeLegend = (element, chart) => {
+    const legend = chart.root.querySelector(".u-legend");
+    figureOf(element)?.querySelector(".legend")?.replaceChildren(legend);
+    return legend;
   };
 
   // Lines over a common axis. `onSelect` is given the ends of a stretch that was drawn.
@@ -120,13 +200,13 @@ const Charts = (() => {
           focus: { prox: 16 },
         },
         focus: { alpha: 0.5 },
-        legend: { live: true },
+        legend: { live: true, markers },
         scales: {
           x: { time: false, distr: spec.logX ? 3 : 1, range: spec.rangeX },
-          y: { distr: spec.logY ? 3 : 1, range: spec.rangeY },
+          y: { distr: spec.logY ? 3 : 1, range: spec.rangeY ?? (spec.leastSpan ? spanning(spec.leastSpan) : undefined) },
         },
         axes: [
-          axis(spec.xLabel, 24, { values: short }),
+          axis(spec.xLabel, 24, { values: short, ...spec.xAxis }),
           axis(spec.yLabel, 62, { values: spec.yValues ?? short, ...spec.yAxis }),
         ],
         series: [
@@ -150,19 +230,21 @@ const Charts = (() => {
       [[], ...spec.series.map(() => [])],
       element,
     );
+    chart.spec = spec;
     element.querySelector(".u-series").classList.add("abscissa");
-    spec.named?.forEach((isNamed, i) => {
-      element.querySelectorAll(".u-series")[i + 1].hidden = !isNamed;
-    });
+    placeLegend(element, chart);
     if (spec.onReset) chart.over.addEventListener("dblclick", spec.onReset);
     return {
       chart,
       destroy: followWidth(element, chart),
       set(data, begin, end) {
+        // An axis without a curve shows nothing.
+        figureOf(element)?.classList.toggle("empty", data.slice(1).every((list) => lastOf(list) === null));
         chart.batch(() => {
           chart.setData(data, begin === undefined);
           if (begin !== undefined) chart.setScale("x", { min: begin, max: end });
         });
+        if (!(chart.cursor.left >= 0) && data[0].length) chart.setLegend({ idx: data[0].length - 1 }, false);
       },
       redraw: () => chart.redraw(false, true),
     };
@@ -187,7 +269,7 @@ const Charts = (() => {
   const dots = drawn((ctx, series, count, at) => {
     const size = 2.2 * devicePixelRatio;
     ctx.fillStyle = series.stroke();
-    ctx.globalAlpha = 0.45; // so that a curve shows over them
+    ctx.globalAlpha = series.alpha_ ?? 0.45; // so that a curve shows over them
     for (let i = 0; i < count; i++) {
       const [x, y] = at(i);
       ctx.fillRect(x - size / 2, y - size / 2, size, size);
@@ -211,7 +293,7 @@ const Charts = (() => {
     ctx.stroke();
   });
 
-  const padded = (values) => {
+  const padded = (values, least = 0) => {
     let low = Infinity;
     let high = -Infinity;
     for (const list of values) {
@@ -220,8 +302,8 @@ const Charts = (() => {
         if (v > high) high = v;
       }
     }
-    if (!(low <= high)) return [0, 1];
-    const margin = 0.05 * (high - low || Math.abs(high) || 1);
+    if (!(low <= high)) return [0, least || 1];
+    const margin = Math.max(0.05 * (high - low || Math.abs(high) || 1), 0.5 * (least - high + low));
     return [low - margin, high + margin];
   };
 
@@ -235,11 +317,11 @@ const Charts = (() => {
         height: height(element),
         padding: [8, 12, 0, 0],
         cursor: { drag: { x: false, y: false }, points: { show: false } },
-        legend: { live: false },
+        legend: { live: false, markers },
         hooks: { drawAxes: [behind(spec)] },
         scales: {
-          x: { time: false, range: () => padded(data.map((pair) => pair[0])) },
-          y: { range: () => padded(data.map((pair) => pair[1])) },
+          x: { time: false, range: () => padded(data.map((pair) => pair[0]), spec.leastX) },
+          y: { range: () => padded(data.map((pair) => pair[1]), spec.leastY) },
         },
         axes: [axis(spec.xLabel, 24, { values: short }), axis(spec.yLabel, 62, { values: short })],
         series: [
@@ -250,6 +332,7 @@ const Charts = (() => {
             width: item.width ?? 2,
             dash: item.dash,
             paths: item.dots ? dots : curve,
+            alpha_: item.faint ? 0.22 : undefined,
             points: { show: false },
           })),
         ],
@@ -257,16 +340,18 @@ const Charts = (() => {
       [null, ...data],
       element,
     );
+    const legend = placeLegend(element, chart);
     return {
       chart,
       destroy: followWidth(element, chart),
       set(pairs) {
         data = pairs;
+        figureOf(element)?.classList.toggle("empty", pairs.every((pair) => pair[0].length === 0));
         // In this mode uPlot counts the points of the data before: without any it draws nothing.
         chart.setData([null, ...pairs], false);
         chart.setData([null, ...pairs]);
         // An empty series has no entry in the legend.
-        element.querySelectorAll(".u-series").forEach((entry, i) => {
+        legend.querySelectorAll(".u-series").forEach((entry, i) => {
           entry.hidden = pairs[i][0].length === 0;
         });
       },
@@ -319,6 +404,92 @@ const Charts = (() => {
     return { chart, destroy: followWidth(element, chart), redraw: () => chart.redraw(false, true) };
   }
 
+  // A line without axes, with the limits of its quantity.
+  function spark(element, spec) {
+    const chart = new uPlot(
+      {
+        ...sizeOf(element),
+        padding: [3, 0, 3, 0],
+        cursor: { show: false },
+        legend: { show: false },
+        hooks: { drawAxes: [behind(spec)] },
+        scales: { x: { time: false }, y: { range: spanning(spec.leastSpan) } },
+        axes: [{ show: false }, { show: false }],
+        series: [{}, { stroke: () => colour(spec.colour), width: 1.5, points: { show: false }, spanGaps: true }],
+      },
+      [[], []],
+      element,
+    );
+    return {
+      chart,
+      destroy: followWidth(element, chart),
+      set: (data, begin, end) => chart.batch(() => {
+        chart.setData(data, false);
+        chart.setScale("x", { min: begin, max: end });
+        chart.setScale("y", { min: null, max: null });
+      }),
+      redraw: () => chart.redraw(false, true),
+    };
+  }
+
+  // Modes of one or several runs as bands over time, faults as marks above them, events as flags.
+  function band(element, spec) {
+    const lanes = spec.lanes.length;
+    const draw = (u) => {
+      const { left, top, width: wide, height: high } = u.bbox;
+      const ctx = u.ctx;
+      const ratio = devicePixelRatio;
+      const [marks, each] = [10 * ratio, (high - 10 * ratio) / lanes];
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(left, top, wide, high);
+      ctx.clip();
+      ctx.font = `600 ${11 * ratio}px system-ui, sans-serif`;
+      ctx.textBaseline = "middle";
+      ctx.textAlign = "left";
+      const x = (t) => u.valToPos(t, "x", true);
+      spec.lanes.forEach((lane, number) => {
+        const upper = top + marks + number * each;
+        for (const [from, to, mode] of stretches(u.data[0], u.data[lane.mode])) {
+          const [name, tone] = spec.modes[mode] ?? ["", "idle"];
+          const [begin, end] = [x(from), x(to)];
+          ctx.fillStyle = colour(`--band-${tone}`);
+          ctx.fillRect(begin, upper + ratio, Math.max(end - begin, ratio), each - 2 * ratio);
+          ctx.fillStyle = "#fff";
+          const shown = Math.max(begin, left);
+          if (ctx.measureText(name).width < Math.min(end, left + wide) - shown - 8 * ratio) ctx.fillText(name, shown + 5 * ratio, upper + 0.5 * each);
+        }
+        ctx.fillStyle = colour("--bad");
+        for (const fault of lane.faults) {
+          u.data[fault].forEach((value, i) => {
+            if (value > 0) ctx.fillRect(x(u.data[0][i]) - ratio, top, 2 * ratio, marks - 2 * ratio);
+          });
+        }
+      });
+      ctx.restore();
+    };
+    const made = lines(element, { ...spec, series: spec.series.map((item) => ({ ...item, paths: () => null })), yAxis: { show: true, values: () => [], grid: { show: false }, ticks: { show: false } }, rangeY: [0, 1] });
+    made.chart.hooks.draw = [draw];
+    return made;
+  }
+
+  // Stretches of a list of modes: begin, end, mode. A value lasts until the next one.
+  function stretches(t, modes) {
+    const found = [];
+    let open = null;
+    t.forEach((time, i) => {
+      const mode = modes[i];
+      if (mode === null || mode === undefined) return;
+      if (open && open[2] === mode) open[1] = time;
+      else {
+        if (open) open[1] = time;
+        open = [time, time, mode];
+        found.push(open);
+      }
+    });
+    return found;
+  }
+
   const steps = uPlot.paths.stepped({ align: 1 });
-  return { lines, plane, cells, steps, sizeOf };
+  return { lines, plane, cells, spark, band, steps, sizeOf, fixed, number, reference, decades, lastOf };
 })();

@@ -112,7 +112,7 @@ def residual_plot(
     """
     joined = _residuals(series)
     over_time = _over_time(
-        joined, joined.values.T[2:4], shown, points, RESIDUAL_FORCE.report_label, _reach_n(joined)
+        joined, joined.values.T[2:4], shown, points, RESIDUAL_FORCE.label, _reach_n(joined)
     )
     panels = [*_clouds(joined, shown, points), over_time, *_spectra(series, shown)]
     caption = (
@@ -141,7 +141,7 @@ def damper_plot(
     columns = [
         np.column_stack(
             [
-                run.height_m * HEIGHT.report_factor,
+                run.height_m * HEIGHT.factor,
                 run.velocity_m_per_s,
                 run.damper_before_n,
                 run.damper_after_n,
@@ -172,9 +172,9 @@ def surface_plot(
     panels = [
         Panel(
             "cells",
-            HEIGHT.report_label,
-            VELOCITY.report_label,
-            mean.height_m * HEIGHT.report_factor,
+            HEIGHT.label,
+            VELOCITY.label,
+            mean.height_m * HEIGHT.factor,
             (curve,),
             (force.ravel(),),
             {
@@ -212,7 +212,7 @@ def held_out_plot(
     of_force = series[0].unit == "N"
     quantity = STRUT_FORCE if of_force else HEIGHT
     reach = floor.residual_force_rmse_n if of_force else floor.height_rmse_m
-    scale, label = quantity.report_factor, quantity.report_label
+    scale, label = quantity.factor, quantity.label
     worst = max(series, key=lambda item: _largest(item.before - item.measured))
     part = excerpt(worst)
     # An envelope is of a series over time, and would tear a loop.
@@ -223,11 +223,11 @@ def held_out_plot(
     panels: list[Panel] = []
     if of_force:
         against = [
-            (VELOCITY.report_label, worst.velocity_m_per_s),
-            (HEIGHT.report_label, HEIGHT.report_factor * worst.height_m),
+            (VELOCITY.label, worst.velocity_m_per_s),
+            (HEIGHT.label, HEIGHT.factor * worst.height_m),
         ]
         panels += [Panel("loops", title, label, x[thin], both, values, {}) for title, x in against]
-    panels.append(Panel("lines", TIME.report_label, label, worst.t_s[thin], both, values, {}))
+    panels.append(Panel("lines", TIME.label, label, worst.t_s[thin], both, values, {}))
     errors = [
         scale * np.column_stack([run.before - run.measured, run.after - run.measured])
         for run in series
@@ -257,7 +257,7 @@ def _residuals(series: Sequence[FittedSeries]) -> Joined:
     columns: list[Array] = []
     for run in series:
         residuals = run.residual_before_n, run.residual_after_n, run.residual_std_n
-        height = run.height_m * HEIGHT.report_factor
+        height = run.height_m * HEIGHT.factor
         columns.append(np.column_stack([height, run.velocity_m_per_s, *residuals]))
     return join(series, columns)
 
@@ -273,7 +273,7 @@ def _clouds(
     points: int,
     *,
     first: int = 0,
-    label: str = RESIDUAL_FORCE.report_label,
+    label: str = RESIDUAL_FORCE.label,
 ) -> list[Panel]:
     there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
     panels: list[Panel] = []
@@ -282,7 +282,7 @@ def _clouds(
         kept = there[cloud(against[there], joined.values[there, 2:4], points // 2)]
         values = [joined.values[kept, 2 + index] for index in range(first, len(shown))]
         extra = {"reach": _finite(_reach_n(joined))}
-        labels = quantity.report_label, label
+        labels = quantity.label, label
         panels.append(Panel("points", *labels, against[kept], shown[first:], values, extra))
     return panels
 
@@ -298,7 +298,7 @@ def _spectra(series: Sequence[FittedSeries], shown: Sequence[LineStyle]) -> list
         # Far below the peak, a smoothed residual only shows the smoother's own roll-off.
         top = math.log10(highest) + 0.3
         extra["y_range"] = [10.0 ** (top - _DECADES), 10.0**top]
-    labels = FREQUENCY.report_label, RESIDUAL_DENSITY.report_label
+    labels = FREQUENCY.label, RESIDUAL_DENSITY.label
     thin = [_thin(curve) for curve in shown]
     return [Panel("lines", *labels, mean.frequency_hz, thin, densities, extra)]
 
@@ -325,7 +325,7 @@ def _over_time(
         ]
     return Panel(
         "lines",
-        f"{TIME.report_label}{' (one after another)' if several else ''}",
+        f"{TIME.label}{' (one after another)' if several else ''}",
         label,
         joined.t_s[kept],
         [_thin(curve) for curve in shown],

@@ -7,6 +7,7 @@ from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, Result
 from rig.machine.installed_versions import version_of
 from rig.pages.html import render_report, write_page
+from rig.pages.number_formats import percent
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,
@@ -17,7 +18,6 @@ from rig.pages.report.figures import (
     residual_plot,
     surface_plot,
 )
-from rig.pages.report.number_formats import percent
 from rig.pages.report.series import check_series
 from rig.pages.report.words import BLOCKS, is_prescribed, sentence
 

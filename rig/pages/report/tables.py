@@ -6,7 +6,7 @@ from typing import NamedTuple
 from dart_model.effects import CATALOGUE, Effect, effect
 from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
 from rig.diagnosis.outcome import BeforeAfter, Diagnosis, Estimate, RunFigures
-from rig.pages.report.number_formats import (
+from rig.pages.number_formats import (
     change,
     label,
     percent,

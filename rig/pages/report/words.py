@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.pages.report.number_formats import (
+from rig.pages.number_formats import (
     decimals_of,
     label,
     number,

@@ -6,21 +6,26 @@ const FRAME_MS = 48;
 const CLOSELY_MS = 1000;
 const RUNS_MS = 1000;
 const HIDDEN_MS = 1000;
-const COLOURS = ["--model", "--second", "--third", "--fourth"];
-const TONES = { live: "good", done: "good", safe: "bad", failed: "bad", killed: "warn", reading: "quiet", absent: "quiet", empty: "warn", unreadable: "bad" };
+const COLOURS = ["--estimated", "--second", "--law", "--fourth"];
+const OF_ORIGIN = { measured: "--measured", model: "--estimated", estimated: "--estimated", observer: "--virtual", error: "--error" };
+const DASHES = [[3, 3], [8, 3, 2, 3], [2, 5], [12, 4]];
+const WORDS = { live: "recording", done: "ended", safe: "ended", waiting: "ended", failed: "ended" };
 
 const at = (id) => document.getElementById(id);
-// The server's table of plots: columns, labels and units.
+// The server's table of plots: columns, quantities and units.
 const TABLE = JSON.parse(at("table").textContent);
 const charts = {};
 let runs = [];
 let shape = ""; // what the charts were made for
 let strut = "";
-// `follow`: the end is the newest step. `span` is a length in s, or null for the whole run.
+let added = Arrange.kept("added") ?? []; // columns of further charts
+let units = Arrange.kept("units") ?? "SI";
+// `follow`: the end is the newest cycle. `span` is a length in s, or null for the whole run.
 const view = { begin: 0, end: 10, span: 10, follow: true };
 let changed = true;
 let drawnAt = 0;
 let evaluatedKey = "";
+let begun = []; // what was drawn last: columns of the chart that is exported
 
 async function ask(path, given = {}) {
   const answer = await fetch(`${path}?${new URLSearchParams(given)}`);
@@ -28,19 +33,27 @@ async function ask(path, given = {}) {
   return answer;
 }
 
+// Factor and name of the unit in which a quantity in SI is shown.
+const unitOf = (unit) => TABLE.units[units][unit] ?? [1, unit];
+const labelOf = ({ name, unit }) => {
+  const shown = unitOf(unit)[1];
+  return `${name} / ${shown.includes("/") ? `(${shown})` : shown}`;
+};
+
 const columnsOf = (name) => [
   ...TABLE.curves.map((curve) => (curve.is_of_strut ? `${name}.${curve.column}` : curve.column)),
-  ...TABLE.state.columns,
+  ...TABLE.band.columns,
+  ...added,
 ];
 
-// Whether the newest steps are requested, at any time.
+// Whether the newest cycles are requested, at any time.
 const isFollowing = () => view.follow && runs.length === 1 && view.span !== null;
 
 // A stretch as plain lists: uPlot takes null for nothing.
 async function stretch(index, points) {
   const columns = columnsOf(strut);
   const [begin_s, end_s] = isFollowing() ? [0, view.span] : [view.begin, view.end];
-  const given = { run: index, begin: begin_s, end: end_s, points, columns: columns.join(",") };
+  const given = { run: index, begin: begin_s, end: end_s, points, columns: columns.join(","), strut };
   if (isFollowing()) given.follow = 1;
   const content = await (await ask("stretch", given)).arrayBuffer();
   const length = new DataView(content).getUint32(0, true);
@@ -62,120 +75,183 @@ async function stretch(index, points) {
 // A label, with its run's name where there are several.
 const named = (index, text) => (runs.length > 1 ? `${runs[index].name}: ${text}` : text);
 
-// Series of each chart over time.
+// Whether a run has a curve: a column that the bench has once is that of a strut only if the model
+// has one strut.
+const has = (run, curve) => curve.is_of_strut || (run.struts.length === 1 && run.columns.includes(curve.column));
+
+// Series of each chart over time: the number of a column, its scale and its look.
 function seriesOf(several) {
-  const measured = (index) => (several ? COLOURS[index % 4] : "--measured");
-  const thin = several ? { dash: [4, 4], width: 1 } : { width: 2 };
-  const series = { state: [] };
-  for (const key of Object.keys(TABLE.labels)) series[key] = [];
-  const [first, ...faults] = TABLE.state.columns.map((_name, i) => TABLE.curves.length + i);
+  const series = Object.fromEntries(Object.keys(TABLE.plots).map((key) => [key, []]));
   runs.forEach((run, index) => {
-    const own = { run: index, colour: COLOURS[index % 4], spanGaps: several };
     TABLE.curves.forEach((curve, column) => {
-      // A column that the bench has once is that of a strut only if the model has one strut.
-      if (!curve.is_of_strut && !(run.struts.length === 1 && run.columns.includes(curve.column))) return;
-      const style = curve.origin === "measured" ? { ...thin, colour: measured(index), spanGaps: true } : {};
-      series[curve.plot].push({ column, label: named(index, curve.label), unit: curve.unit, ...own, ...style });
+      if (!has(run, curve)) return;
+      const [factor, unit] = unitOf(TABLE.plots[curve.plot].unit);
+      const isMeasured = curve.origin === "measured";
+      const colour = several ? COLOURS[index % 4] : OF_ORIGIN[curve.origin];
+      const look = several && isMeasured ? { dash: [5, 4], width: 1 } : { width: isMeasured ? 2 : 1.4 };
+      // Where the load cell has a sample, and where the runs' cycles do not coincide.
+      const spanGaps = several || isMeasured || curve.origin === "error";
+      series[curve.plot].push({ run: index, column, factor, unit, colour, spanGaps, label: named(index, curve.label), ...look });
     });
-    series.state.push({ column: first, label: named(index, "state"), width: 3, paths: Charts.steps, ...own, level: (v) => v + TABLE.state.first_mode_level });
-    faults.forEach((column, level) => series.state.push({
-      run: index, column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null),
-    }));
+  });
+  const first = TABLE.curves.length + TABLE.band.columns.length;
+  added.forEach((column, i) => {
+    const [, , si] = splitColumn(column);
+    const [factor, unit] = unitOf(si);
+    series[`more-${i}`] = runs.map((_run, index) => ({ run: index, column: first + i, factor, unit, colour: COLOURS[index % 4], spanGaps: true, width: 1.4, label: named(index, column) }));
   });
   return series;
+}
+
+const SUFFIXES = [["_m_per_s2", "m/s²"], ["_m_per_s", "m/s"], ["_n_per_s", "N/s"], ["_mbar", "mbar"], ["_ns", "ns"], ["_m", "m"], ["_n", "N"], ["_c", "°C"], ["_s", "s"], ["_hz", "Hz"]];
+
+// Name, strut or empty, and SI unit of a column of the log.
+function splitColumn(column) {
+  const [owner, name] = column.includes(".") ? column.split(/\.(.*)/s) : ["", column];
+  const [suffix, unit] = SUFFIXES.find(([end]) => name.endsWith(end)) ?? ["", ""];
+  return [name.slice(0, name.length - suffix.length).replaceAll("_", " "), owner, unit];
+}
+
+// Limits of the configuration on some quantities of the strut that is shown.
+function limitsOf(values) {
+  const rows = runs[0]?.supervision?.limits ?? [];
+  return rows
+    .filter((row) => values.includes(row.value) && !row.channel && (!row.strut || row.strut === strut))
+    .flatMap((row) => [row.low, row.high])
+    .filter((value) => typeof value === "number");
 }
 
 let shown = {};
 
 function build() {
   evaluatedKey = "";
-  for (const chart of Object.values(charts)) chart.destroy();
+  for (const [id, chart] of Object.entries(charts)) {
+    chart.destroy();
+    delete charts[id];
+  }
   const several = runs.length > 1;
+  placeAdded();
   shown = seriesOf(several);
-  const common = { sync: "t", xLabel: TABLE.time, xUnit: TABLE.time_unit, onSelect: look, onReset: newest };
-  const over = (id, yLabel, more = {}) => {
-    charts[id] = Charts.lines(at(id), { ...common, yLabel, series: shown[id], ...more });
+  const common = { sync: "t", xName: "t", xUnit: TABLE.time_unit, onSelect: look, onReset: newest };
+  const over = (id, quantity, more = {}) => {
+    const [factor, unit] = unitOf(quantity.unit);
+    const limits = limitsOf(LIMITED[id] ?? []).map((value) => value * factor);
+    charts[id] = Charts.lines(at(id), { ...common, yLabel: unit, series: shown[id], leastSpan: factor * quantity.least_span, limits, ...more });
   };
-  for (const [id, label] of Object.entries(TABLE.labels)) over(id, label);
-  const { levels } = TABLE.state;
-  over("state", "", {
-    rangeY: [-0.5, levels.length - 0.5],
-    yValues: (_u, ticks) => ticks.map((v) => levels[v] ?? ""),
-    yAxis: { splits: () => levels.map((_name, i) => i), size: 90, labelSize: 0 },
-    named: shown.state.map((item) => item.label !== ""),
+  const bare = { xAxis: { size: 6, values: () => [], label: null, ticks: { show: false } } };
+  for (const [id, quantity] of Object.entries(TABLE.plots)) {
+    at(id).closest(".figure").hidden = shown[id].length === 0;
+    over(id, quantity, id === "virtual" ? {} : { ...bare, yAxis: { space: quantity.is_strip ? 18 : 30 } });
+  }
+  added.forEach((column, i) => over(`more-${i}`, { unit: splitColumn(column)[2], least_span: 0 }));
+  const [mode, ...faults] = TABLE.band.columns.map((_name, i) => TABLE.curves.length + i);
+  shown.band = runs.flatMap((_run, run) => [mode, ...faults].map((column) => ({ run, column, factor: 1, label: "", colour: "--text" })));
+  const each = TABLE.band.columns.length;
+  charts.band = Charts.band(at("band"), {
+    ...common, xLabel: "time / s", yLabel: "", series: shown.band, modes: TABLE.band.modes,
+    lanes: runs.map((_run, i) => ({ mode: 1 + i * each, faults: faults.map((_fault, k) => 2 + i * each + k) })),
   });
-  const laws = several ? runs.map((run, i) => ({ label: `${run.name}: law`, colour: COLOURS[i % 4], dash: [8, 4] })) : [{ label: "model’s law", colour: "--model" }];
   const { planes, spectrum, ticks } = TABLE;
-  const points = runs.flatMap((run, i) => [
-    { label: several ? run.name : planes.estimated, colour: several ? COLOURS[i % 4] : "--second", dots: true },
-    { label: named(i, planes.measured), colour: "--measured", dots: true },
-  ]);
-  for (const { name, label } of Object.values(planes.motions)) {
-    charts[`plane-${name}`] = Charts.plane(at(`plane-${name}`), {
-      xLabel: label, yLabel: planes.force, series: [...points, ...laws, { label: "other models", colour: "--third", dash: [3, 3] }],
+  const points = runs.flatMap((_run, i) => {
+    const colour = several ? COLOURS[i % 4] : "--estimated";
+    return [
+      { label: named(i, planes.estimated), colour, dots: true, faint: true },
+      { label: named(i, planes.measured), colour: "--measured", dots: true },
+      { label: named(i, "last cycle"), colour, width: 2.4 },
+    ];
+  });
+  const laws = runs.map((_run, i) => ({ label: named(i, "model’s law"), colour: several ? COLOURS[i % 4] : "--law", dash: [8, 4] }));
+  const others = runs[0].models.map((name, i) => ({ label: `law of ${name}`, colour: "--fourth", dash: DASHES[i % 4] }));
+  for (const quantity of Object.values(planes.motions)) {
+    const leastX = unitOf(quantity.unit)[0] * quantity.least_span;
+    charts[`plane-${quantity.name}`] = Charts.plane(at(`plane-${quantity.name}`), {
+      xLabel: labelOf(quantity), yLabel: unitOf(planes.force.unit)[1], leastX, leastY: planes.force.least_span, series: [...points, ...laws, ...others],
     });
   }
-  const { frequency } = spectrum;
+  const density = unitOf("N/√Hz")[1];
   charts.spectrum = Charts.lines(at("spectrum"), {
-    xLabel: frequency.label, xName: frequency.name, xUnit: frequency.unit, yLabel: "N / √Hz", logX: true, logY: true,
-    series: runs.map((run, i) => ({ label: several ? run.name : spectrum.label, unit: "N/√Hz", colour: COLOURS[i % 4], spanGaps: true })),
+    xLabel: labelOf(spectrum.frequency), xName: spectrum.frequency.name, xUnit: spectrum.frequency.unit, yLabel: density, logX: true, logY: true, rangeY: Charts.decades,
+    series: runs.map((run, i) => ({ label: several ? run.name : spectrum.label, unit: density, colour: several ? COLOURS[i % 4] : "--virtual", spanGaps: true })),
   });
   charts.timing = Charts.lines(at("timing"), {
-    xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "ticks", logX: true, logY: true,
-    series: ticks.curves.map((label, i) => ({ label, colour: ["--second", "--model"][i], paths: Charts.steps })),
+    xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "cycles", logX: true, logY: true,
+    series: ticks.curves.map((label, i) => ({ label, colour: ["--virtual", "--estimated"][i], paths: Charts.steps })),
   });
+  Glance.build(TABLE.plots, limitsOf, unitOf);
 }
+
+const LIMITED = { height: ["measured_height_m", "height_m"], force: ["force_n"], innovation: ["innovation_m"], "force-error": ["force_difference_n"], virtual: ["virtual_force_n"] };
+
+// Whether a chart is looked at: those behind a tab cost nothing.
+const isSeen = (id) => at(id).offsetParent !== null || document.fullscreenElement?.contains(at(id));
 
 function draw(found) {
   const [first] = found;
   if (isFollowing()) {
     view.end = first.head.end_s;
-    view.begin = view.end - view.span;
+    view.begin = Math.max(view.end - view.span, first.head.span_s[0]);
+    if (view.end <= view.begin) view.end = view.begin + 1e-3;
   }
   found.forEach((item, i) => {
     runs[i].span_s = item.head.span_s;
     runs[i].state = item.head.state;
+    runs[i].banner = item.head.banner;
   });
+  banners();
   // A long run is read piece by piece: the whole of it is longer the next time.
   if (view.follow && last() > view.end + 1e-6) changed = true;
   const width = columnsOf(strut).length;
   const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
+  begun = [width, t];
   for (const id of Object.keys(shown)) {
+    if (!isSeen(id)) continue;
     const lists = shown[id].map((item) => {
       const list = t[1 + item.run * width + item.column];
-      return item.level ? list.map((v) => (v === null || v === undefined ? null : item.level(v))) : list;
+      return item.factor === 1 ? list : list.map((v) => (v === null || v === undefined ? null : item.factor * v));
     });
     charts[id].set([t[0], ...lists], view.begin, view.end);
   }
+  const lists = Object.fromEntries(TABLE.curves.map((curve, i) => [curve.column, has(runs[0], curve) ? first.lists[i] : []]));
+  const withCell = runs[0].columns.includes("force_error_n");
+  Glance.tiles({ ...first.head.latest, withCell }, TABLE.band.modes[first.head.latest.mode]?.[0], first.t, lists, view.begin, view.end);
   const steps = found.reduce((sum, item) => sum + item.head.steps, 0);
-  at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${steps.toLocaleString("en")} ticks`;
+  at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${Charts.fixed(steps, 0)} cycles`;
   document.body.dataset.end = first.head.span_s[1];
   document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
 }
 
+function banners() {
+  const items = runs.map((run) => ({ ...run.banner, name: run.name, can_ask: token !== "" && run.state === "live" }));
+  Glance.banners(items, (run, request) => demand("set", run, { request }));
+}
+
 async function evaluateStretch() {
-  const key = [view.begin, view.end, strut].join();
+  const key = [view.begin, view.end, strut, units].join();
   if (document.hidden || shape === "" || key === evaluatedKey) return;
   const given = { begin: view.begin, end: view.end, strut };
   const found = await Promise.all(runs.map(async (_run, run) => (await ask("closely", { run, ...given })).json()));
-  for (const [id, { name }] of Object.entries(TABLE.planes.motions)) {
-    const points = found.flatMap((item) => [item.planes[`${id}:estimated`], item.planes[`${id}:measured`]]);
-    const own = found.map((item) => item.laws.model?.[id] ?? [[], []]);
-    const others = Object.entries(found[0].laws).filter(([other]) => other !== "model").map(([, law]) => law[id]);
-    // One line for all others, with a gap between two.
-    const joined = others.reduce(([xs, ys], [x, y]) => [[...xs, NaN, ...x], [...ys, NaN, ...y]], [[], []]);
-    charts[`plane-${name}`].set([...points, ...own, joined]);
+  const force = unitOf(TABLE.planes.force.unit)[0];
+  for (const [id, quantity] of Object.entries(TABLE.planes.motions)) {
+    const motion = unitOf(quantity.unit)[0];
+    const scaled = ([xs, ys]) => [xs.map((x) => x * motion), ys.map((y) => y * force)];
+    const points = found.flatMap((item) => ["estimated", "measured", "recent"].map((kind) => scaled(item.planes[`${id}:${kind}`])));
+    const own = found.map((item) => scaled(item.laws.model?.[id] ?? [[], []]));
+    const others = runs[0].models.map((name) => scaled(found[0].laws[name]?.[id] ?? [[], []]));
+    charts[`plane-${quantity.name}`].set([...points, ...own, ...others]);
   }
-  const spectra = found.map((item) => [item.spectrum.frequency_hz, item.spectrum.density]);
-  charts.spectrum.set(spectra.length === 1 ? spectra[0] : uPlot.join(spectra));
+  const scale = unitOf("N/√Hz")[0];
+  const spectra = found.map((item) => [item.spectrum.frequency_hz, item.spectrum.density.map((v) => v * scale)]);
+  if (isSeen("spectrum")) charts.spectrum.set(spectra.length === 1 ? spectra[0] : uPlot.join(spectra));
   const timing = found[0].timing;
   at("timing").closest("section").hidden = !timing;
-  if (timing) {
+  at("no-timing").hidden = Boolean(timing);
+  if (timing && isSeen("timing")) {
     const some = (list) => list.map((v) => (v > 0 ? v : null));
     charts.timing.set([timing.edges_us.map((v) => Math.max(v, 0.5)), ...TABLE.ticks.curves.map((name) => some(timing[name]))]);
   }
   at("longest").textContent = found[0].longest_s;
   figures(found);
+  events(found);
   evaluatedKey = key;
 }
 
@@ -184,23 +260,142 @@ function figures(found) {
   found.forEach((item, i) => {
     const name = runs.length > 1 ? `${runs[i].name}: ` : "";
     if (item.bus.load !== undefined) {
-      rows.push([`${name}bus load`, `${(100 * item.bus.load).toFixed(1)} %`]);
-      rows.push([`${name}frames`, `${item.bus.frames_per_s.toFixed(0)} /s`]);
+      rows.push([`${name}bus load`, `${Charts.fixed(100 * item.bus.load, 1)} %`]);
+      rows.push([`${name}frames`, `${Charts.fixed(item.bus.frames_per_s, 0)} /s`]);
     }
-    if (item.timing) rows.push([`${name}longest gap`, `${(item.timing.longest_gap_us / 1000).toFixed(2)} ms`]);
+    if (item.timing) rows.push([`${name}longest gap`, `${Charts.fixed(item.timing.longest_gap_us / 1000, 2)} ms`]);
     const counts = Object.entries(runs[i].counts ?? {}).filter(([key, value]) => value > 0 && key !== "started");
-    for (const [key, value] of counts) rows.push([`${name}${key.replaceAll("_", " ")}`, value.toLocaleString("en")]);
-    if (runs[i].counts && counts.length === 0) rows.push([`${name}faults counted`, "none"]);
+    for (const [key, value] of counts) rows.push([`${name}${COUNTED[key] ?? key.replaceAll("_", " ")}`, Charts.fixed(value, 0)]);
+    if (runs[i].counts && counts.length === 0) rows.push([`${name}faults`, "no faults"]);
     if (runs[i].diverged) rows.push([`${name}diverged`, `${runs[i].diverged.strut}, ${runs[i].diverged.t_s.toFixed(3)} s`]);
   });
-  const list = at("figures");
-  list.replaceChildren(
+  at("figures").replaceChildren(
     ...rows.map(([name, value]) => {
       const pair = document.createElement("div");
       pair.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: value }));
       return pair;
     }),
   );
+}
+
+const COUNTED = { overruns: "cycles missed", stale: "cycles in HOLD", lost: "frames lost", refused: "frames refused" };
+
+// Events of the runs, the newest first; a click shows the second about one.
+function events(found) {
+  const items = found.flatMap((item, i) => item.events.map((event) => ({ ...event, run: i }))).sort((a, b) => b.t_s - a.t_s);
+  const asked = JSON.stringify(items);
+  if (at("events").dataset.asked === asked) return;
+  at("events").dataset.asked = asked;
+  at("events").replaceChildren(...items.map((event) => {
+    const entry = document.createElement("li");
+    const text = `${event.t_s.toFixed(3)} s  ${named(event.run, event.what)}${event.why ? `: ${event.why}` : ""}`;
+    const button = Object.assign(document.createElement("button"), { textContent: text });
+    button.addEventListener("click", () => showEvent(event.t_s, text));
+    entry.append(button);
+    return entry;
+  }));
+  at("events").events = items;
+}
+
+function showEvent(t_s, text) {
+  at("event").textContent = text;
+  look(Math.max(0, t_s - 0.5), t_s + 0.5);
+}
+
+// A click into the band shows the event next to it.
+at("band").addEventListener("click", (event) => {
+  const chart = charts.band?.chart;
+  if (!chart) return;
+  const x = event.clientX - chart.over.getBoundingClientRect().left;
+  const near = [...(at("events").events ?? [])].map((item) => [Math.abs(chart.valToPos(item.t_s, "x") - x), item]).sort((a, b) => a[0] - b[0])[0];
+  if (near && near[0] < 8) showEvent(near[1].t_s, `${near[1].t_s.toFixed(3)} s  ${near[1].what}${near[1].why ? `: ${near[1].why}` : ""}`);
+});
+
+// --- Further charts, export, second cursor, link --------------------------------------------------
+
+function placeAdded() {
+  added = added.filter((column) => runs.some((run) => run.columns.includes(column)));
+  at("added").replaceChildren(...added.map((column, i) => {
+    const copy = at("force").closest(".figure").cloneNode(true);
+    copy.dataset.chart = `more-${i}`;
+    copy.hidden = false;
+    copy.querySelector("h2").textContent = column;
+    const chart = copy.querySelector(".chart");
+    chart.replaceChildren();
+    copy.querySelector(".legend").replaceChildren();
+    chart.id = `more-${i}`;
+    chart.setAttribute("aria-label", `${column} over time`);
+    const remove = Object.assign(document.createElement("button"), { textContent: "✕", className: "remove" });
+    remove.setAttribute("aria-label", `Remove the chart of ${column}`);
+    remove.addEventListener("click", () => arrangeAdded(added.filter((name) => name !== column)));
+    copy.querySelector(".head").append(remove);
+    return copy;
+  }));
+  const names = [...new Set(runs.flatMap((run) => run.columns))].filter((name) => !["t_ns", ...added].includes(name));
+  at("quantity").replaceChildren(...names.map((name) => new Option(name, name)));
+}
+
+function arrangeAdded(columns) {
+  added = Arrange.kept("added", columns);
+  build();
+  update();
+}
+
+at("add").addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (at("quantity").value) arrangeAdded([...added, at("quantity").value]);
+});
+
+// Every cycle of what is shown, from the server; of a spectrum or plane what is drawn.
+async function csvOf(id) {
+  const columns = (shown[id] ?? []).filter((item) => item.run === 0).map((item) => columnsOf(strut)[item.column]);
+  if (columns.length) return (await ask("csv", { run: 0, begin: view.begin, end: view.end, columns: columns.join(",") })).text();
+  const { chart } = charts[id];
+  const { series, data } = chart;
+  if (chart.mode === 2) return data.slice(1).flatMap((pair, i) => pair[0].map((x, k) => [`"${series[i + 1].label}"`, x, pair[1][k]].join())).join("\n");
+  const rows = data[0].map((_x, k) => data.map((list) => list[k] ?? "").join());
+  return [series.map((item) => `"${item.label}"`).join(), ...rows].join("\n");
+}
+
+Arrange.exports(charts, (id) => `${runs.map((run) => run.name).join("-")}-${id}`, csvOf);
+
+function setReference() {
+  const { left } = charts.height.chart.cursor;
+  const middle = 0.5 * (view.begin + view.end);
+  Charts.reference.x = Charts.reference.x !== null ? null : left >= 0 ? charts.height.chart.posToVal(left, "x") : middle;
+  const isSet = Charts.reference.x !== null;
+  at("reference").setAttribute("aria-pressed", String(isSet));
+  at("reference").textContent = isSet ? `Δ from ${Charts.reference.x.toFixed(3)} s` : "Δ cursor";
+  update();
+}
+
+at("reference").addEventListener("click", setReference);
+at("link").addEventListener("click", async () => {
+  const shownNow = new URLSearchParams({ begin: view.begin.toFixed(6), end: view.end.toFixed(6), strut, units });
+  history.replaceState(null, "", `?${shownNow}${location.hash}`);
+  await navigator.clipboard?.writeText(location.href.split("#")[0]);
+  at("link").textContent = "Copied";
+  setTimeout(() => (at("link").textContent = "Link"), 1500);
+});
+at("units").value = units;
+at("units").addEventListener("change", () => {
+  units = Arrange.kept("units", at("units").value);
+  build();
+  update();
+});
+document.addEventListener("arranged", () => {
+  evaluatedKey = "";
+  changed = true;
+});
+document.addEventListener("fullscreenchange", () => Object.values(charts).forEach((chart) => chart.chart.setSize(Charts.sizeOf(chart.chart.root.parentElement))));
+
+// What a link asks for, once.
+function takeLink() {
+  const given = new URLSearchParams(location.search);
+  if (given.has("strut") && [...at("strut").options].some((option) => option.value === given.get("strut"))) strut = at("strut").value = given.get("strut");
+  if (TABLE.units[given.get("units")]) units = at("units").value = given.get("units");
+  const [begin, end] = ["begin", "end"].map((name) => Number(given.get(name)));
+  return given.has("begin") && end > begin ? [begin, end] : null;
 }
 
 // --- The visible stretch ---------------------------------------------------------------------
@@ -251,8 +446,8 @@ const token = decodeURIComponent(location.hash.slice(1));
 function control() {
   const live = runs.findIndex((run) => run.state === "live");
   at("control").hidden = token === "" || live < 0;
-  const named = runs.length > 1 && live >= 0 ? `Control of ${runs[live].name}` : "Control";
-  at("control").querySelector("h2").textContent = named;
+  at("no-control").hidden = !at("control").hidden;
+  at("control-of").textContent = runs.length > 1 && live >= 0 ? `Control of ${runs[live].name}` : "Control";
   const { observers, supervision } = runs[Math.max(live, 0)];
   const keys = [...numbers("observers", observers), ...numbers("supervision", supervision)];
   const asked = JSON.stringify([live, keys]);
@@ -335,6 +530,7 @@ async function readDiagnosis() {
   const none = at("diagnosed").options.length === 0;
   const found = none ? { state: "none" } : await (await ask("diagnosis", { run: diagnosed() })).json();
   at("diagnosis").hidden = none || (token === "" && found.state === "none");
+  at("no-diagnosis").hidden = !at("diagnosis").hidden;
   const running = found.state === "running";
   at("start").hidden = token === "" || running;
   at("cancel").hidden = token === "" || !running;
@@ -367,7 +563,7 @@ async function readRuns() {
     const entry = document.createElement("div");
     entry.className = "run";
     const name = Object.assign(document.createElement("b"), { textContent: run.name, title: run.folder });
-    const pill = Object.assign(document.createElement("span"), { textContent: run.state, title: run.words, className: `pill ${TONES[run.state] ?? "quiet"}` });
+    const pill = Object.assign(document.createElement("span"), { textContent: WORDS[run.state] ?? run.state, title: run.words, className: "pill quiet" });
     const about = Object.assign(document.createElement("span"), { className: "quiet", textContent: [run.model, run.rate_hz ? `${run.rate_hz} Hz` : ""].filter(Boolean).join(", ") });
     if (runs.length > 1) entry.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
     entry.append(name, pill, about);
@@ -375,9 +571,8 @@ async function readRuns() {
   });
   at("runs").replaceChildren(...list);
   document.title = `${runs.map((run) => run.name).join(", ")} – rig view`;
-  const said = runs.filter((run) => !["live", "done"].includes(run.state)).map((run) => run.words);
-  at("message").hidden = said.length === 0;
-  at("message").textContent = said.join(" ");
+  at("message").hidden = true;
+  banners();
   control();
   const struts = [...new Set(runs.flatMap((run) => run.struts))];
   const ready = runs.some((run) => run.steps > 0) && struts.length > 0;
@@ -389,12 +584,12 @@ async function readRuns() {
     strut = struts.includes(strut) ? strut : struts.at(-1);
     select.value = strut;
     at("strut-label").hidden = struts.length < 2;
+    const asked = shape === "" ? takeLink() : null;
     build();
-    if (shape === "" && !runs.some((run) => run.state === "live")) {
-      at("span").value = "whole";
-    }
+    if (shape === "" && !runs.some((run) => run.state === "live")) at("span").value = "whole";
     shape = now;
     newest();
+    if (asked) look(...asked);
   }
 }
 
@@ -436,10 +631,10 @@ function lost() {
 }
 
 function keyboard(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName) || event.target.role === "tab") return;
   const actions = {
     " ": pause, ArrowLeft: () => move(-0.25), ArrowRight: () => move(0.25), "+": () => zoom(0.5),
-    "-": () => zoom(2), Home: () => follow(null), End: newest,
+    "-": () => zoom(2), Home: () => follow(null), End: newest, m: setReference,
   };
   const action = actions[event.key];
   if (action === undefined || (event.key === " " && event.target.tagName === "BUTTON")) return;
@@ -450,6 +645,7 @@ function keyboard(event) {
 function theme(name) {
   document.documentElement.dataset.theme = name;
   for (const chart of Object.values(charts)) chart.redraw();
+  Glance.redraw();
 }
 
 at("span").addEventListener("change", newest);
@@ -470,6 +666,7 @@ at("theme").addEventListener("click", () => {
   theme(name);
 });
 document.addEventListener("keydown", keyboard);
+Arrange.open(Arrange.kept("tab") ?? "tab-virtual");
 theme(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
 every(RUNS_MS, readRuns);
 every(FRAME_MS, frame);

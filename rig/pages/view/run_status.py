@@ -10,9 +10,14 @@ from can_dbc.bus_load import frame_time_s
 from can_dbc.database import load_database
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, load_model
-from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
-from rig.log.follower import RunFollower
+from rig.bridge.values import Mode
+from rig.log.file_names import DBC_FILE, EVENTS_FILE, MODEL_FILE, RUN_FILE
+from rig.log.follower import FORCE_ERROR, RunFollower
 from rig.log.reader import ConfigEntry, Ending, RunHeader, read_header
+from rig.pages.mode_band import parse_events
+from rig.pages.mode_words import LoggedEvent
+from rig.pages.plotted_quantities import LOAD_CELL, MODE_COLUMN
+from rig.pages.view.banner import Banner, make_banner
 
 _SILENT_S = 2.0
 """Time without a write after which a run without an ending counts as killed."""
@@ -39,6 +44,9 @@ class WatchedRun:
         """The model that ran; None before its copy exists."""
         self.frame_times_s: Mapping[tuple[int, bool], float] = {}
         """Time that a frame occupies the bus, by identifier and whether that is extended."""
+        self.events: list[LoggedEvent] = []
+        """Events so far."""
+        self._events_read = 0
         self._stamp = -1.0
         self._error: str | None = None
 
@@ -72,12 +80,14 @@ class WatchedRun:
                     # The folder holds another run.
                     self.follower = RunFollower(self.folder)
                     self.model, self.frame_times_s = None, {}
+                    self.events, self._events_read = [], 0
                 self.header = header
                 self._read_copies()
             except InputError as error:
                 self._error = str(error)
         if self._error is None:
             self.follower.update(_STEPS_AT_ONCE)
+            self._read_events()
 
     def state(self) -> tuple[str, str]:
         """A word for the state of the run, and a sentence about it."""
@@ -95,6 +105,19 @@ class WatchedRun:
             "No longer written, and without an ending: it was killed. "
             f"`rig replay {self.folder}` computes the missing steps from its frames."
         )
+
+    def has(self, column: str) -> bool:
+        """Whether the run has a column that is shown."""
+        return column != FORCE_ERROR or LOAD_CELL.column in self.follower.columns
+
+    def banner(self) -> Banner:
+        """What the banner of the run shows."""
+        newest = self.follower.newest
+        now = None
+        if newest is not None:
+            mode = newest[self.follower.columns.index(MODE_COLUMN)]
+            now = Mode(int(mode)), float(newest[0]) * 1e-9
+        return make_banner(self.state(), now, self.config, self.events)
 
     def _without_header(self) -> tuple[str, str]:
         if not self.folder.exists():
@@ -125,6 +148,15 @@ class WatchedRun:
             entries = [entry for entry in self.folder.iterdir() if entry.suffix in endings]
             stamps += [entry.stat().st_mtime for entry in entries]
         return time.time() - max(stamps)
+
+    def _read_events(self) -> None:
+        """Take the events that were written since; the last line may still be on its way."""
+        with contextlib.suppress(OSError), (self.folder / EVENTS_FILE).open("rb") as file:
+            file.seek(self._events_read)
+            lines = file.read()
+            lines = lines[: lines.rfind(b"\n") + 1]
+            self._events_read += len(lines)
+            self.events += parse_events(lines)
 
     def _read_copies(self) -> None:
         model, dbc = self.folder / MODEL_FILE, self.folder / DBC_FILE

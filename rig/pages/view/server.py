@@ -27,6 +27,7 @@ from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import REPORT_FILE
 from rig.log.file_names import MODEL_FILE
 from rig.pages import charts
+from rig.pages.mode_band import list_events
 from rig.pages.view import visible_stretch
 from rig.pages.view.diagnosis_job import DiagnosisJob
 from rig.pages.view.live_page import live_page
@@ -56,9 +57,11 @@ _LENGTH = re.compile(r"[0-9]{1,9}")
 _HTTP_PORT = 80
 """Port that a browser leaves out of the host's name."""
 _HERE = Path(__file__).parent
-_STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
+_STYLES = (*charts.STYLES, _HERE / "page.css")
+_SCRIPTS = (*charts.SCRIPTS, *(_HERE / name for name in ("glance.js", "arrange.js", "page.js")))
 
 _HTML = "text/html; charset=utf-8"
+_CSV = "text/csv; charset=utf-8"
 _FILES: Mapping[str, tuple[Path, str]] = {
     **{f"/{path.name}": (path, "text/css; charset=utf-8") for path in _STYLES},
     **{f"/{path.name}": (path, "text/javascript; charset=utf-8") for path in _SCRIPTS},
@@ -391,11 +394,12 @@ def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, object]:
             "folder": str(run.folder),
             "state": state,
             "words": words,
+            "banner": run.banner()._asdict(),
             "model": run.model.name if run.model is not None else None,
             "struts": [strut.name for strut in run.model.struts] if run.model is not None else [],
             "rate_hz": config.get("rate_hz"),
             "epoch_ns": "" if run.epoch_ns is None else str(run.epoch_ns),
-            "columns": list(run.follower.columns),
+            "columns": [name for name in run.follower.columns if run.has(name)],
             "span_s": run.follower.span_s,
             "steps": run.follower.steps,
             "counts": ending.get("counts"),
@@ -423,6 +427,8 @@ def _stretch(view: ViewServer, query: _Query) -> Answer:
         head = {
             "span_s": run.follower.span_s,
             "state": run.state()[0],
+            "banner": run.banner()._asdict(),
+            "latest": visible_stretch.latest(run.follower, query.text("strut"), end_s),
             "begin_s": begin_s,
             "end_s": end_s,
             "count": len(window.t_s),
@@ -454,8 +460,19 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
                     run.folder, run.epoch_ns or 0, run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
+                "events": [event._asdict() for event in list_events(run.events)[0]],
             }
         )
+
+
+def _csv(view: ViewServer, query: _Query) -> Answer:
+    """Every cycle of a stretch as CSV, times in s and columns in SI units."""
+    run = query.run(view)
+    begin_s, end_s = query.stretch()
+    names = [name for name in query.text("columns").split(",") if name][:_MOST_COLUMNS]
+    with run.lock:
+        run.update()
+        return visible_stretch.csv_of(run.follower, begin_s, end_s, names).encode(), _CSV, _POLICY
 
 
 def _diagnosis(view: ViewServer, query: _Query) -> Answer:
@@ -473,6 +490,7 @@ _ANSWERS: Mapping[str, Callable[[ViewServer, _Query], Answer]] = {
     "/runs": _runs,
     "/stretch": _stretch,
     "/closely": _closely,
+    "/csv": _csv,
     "/diagnosis": _diagnosis,
     "/report": _report,
 }

@@ -1,6 +1,7 @@
 """Curves and figures of the visible stretch of a run."""
 
 import contextlib
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,15 +15,24 @@ from dart_model.spec import ModelSpec
 from rig.channels.measured_quantities import TEMPERATURE
 from rig.log.candump import LATEST_S, parse_frame
 from rig.log.file_names import FRAMES_FILE, parts
-from rig.log.follower import RunFollower
+from rig.log.follower import FORCE_ERROR, RunFollower
 from rig.pages.plotted_quantities import (
     ESTIMATED_FORCE,
+    HEIGHT_ERROR_CURVE,
     LOAD_CELL,
+    MEASURED_HEIGHT,
+    MODE_COLUMN,
+    MODEL_HEIGHT,
     MOTION_COLUMNS,
     VIRTUAL_FORCE_CURVE,
 )
 
 Array = NDArray[np.float64]
+
+LATEST_WINDOW_S = 1.0
+"""Length of the stretch whose root mean squares are shown as present: some periods of a motion."""
+
+FORCE_STD = "force_std_n"
 
 LONGEST_S = 60.0
 """Length of the end of a stretch that is evaluated; a longer one is cut."""
@@ -32,6 +42,9 @@ _ACROSS, _UP = 240, 160
 
 _LINE_POINTS = 81
 """Points of a law's curve: a few pixels apart in a chart."""
+
+_CYCLE_POINTS = 400
+"""Points of the last cycle's line."""
 
 _SPECTRUM_POINTS = 4096
 _LINES_READ = 60_000
@@ -45,22 +58,88 @@ def rows_between(follower: RunFollower, begin_s: float, end_s: float) -> Array:
     return rows[(rows[:, 0] >= begin_s * 1e9) & (rows[:, 0] <= end_s * 1e9 + 0.5)]
 
 
+def latest(follower: RunFollower, strut: str, end_s: float) -> dict[str, float]:
+    """Figures of the second before a time, by name; what was not measured is absent.
+
+    Last values of the measured and the model height, of the force and its standard deviation, and
+    of the mode's number; root mean squares of height error and force error, and the load cell's
+    largest force.
+    """
+    rows = follower.rows(*follower.between(end_s - LATEST_WINDOW_S, end_s))
+    rows = rows[(rows[:, 0] > 1e9 * (end_s - LATEST_WINDOW_S)) & (rows[:, 0] <= end_s * 1e9 + 0.5)]
+
+    def finite(name: str) -> Array:
+        values = _column(rows, follower.columns, name)
+        return values[np.isfinite(values)]
+
+    last = {
+        MEASURED_HEIGHT.column: finite(MEASURED_HEIGHT.column_of(strut)),
+        MODEL_HEIGHT.column: finite(MODEL_HEIGHT.column_of(strut)),
+        ESTIMATED_FORCE.column: finite(ESTIMATED_FORCE.column_of(strut)),
+        FORCE_STD: finite(f"{strut}.{FORCE_STD}"),
+    }
+    last["mode"] = finite(MODE_COLUMN)
+    found = {name: float(values[-1]) for name, values in last.items() if len(values)}
+    for name, column in (
+        ("height_error_rms_m", HEIGHT_ERROR_CURVE.column_of(strut)),
+        ("force_error_rms_n", FORCE_ERROR),
+    ):
+        if len(values := finite(column)):
+            found[name] = float(np.sqrt(np.mean(values**2)))
+    if len(values := finite(LOAD_CELL.column)):
+        found["load_cell_peak_n"] = float(np.abs(values).max())
+    return found
+
+
+def csv_of(follower: RunFollower, begin_s: float, end_s: float, names: Sequence[str]) -> str:
+    """Cycles of a stretch as CSV, times in s first; a stretch is cut to its last `LONGEST_S`."""
+    rows = rows_between(follower, begin_s, end_s)
+    columns = [rows[:, 0] * 1e-9, *(_column(rows, follower.columns, name) for name in names)]
+    text = io.StringIO()
+    header = ",".join(("t_s", *names))
+    np.savetxt(text, np.column_stack(columns), "%.10g", ",", header=header, comments="")
+    return text.getvalue().replace("nan", "")
+
+
 def planes(
     follower: RunFollower, rows: Array, strut: str, *, with_cell: bool
 ) -> dict[str, list[list[float]]]:
     """Points of force over velocity and over height: of the estimate, and of the load cell.
 
-    `rows` are of `rows_between`; `with_cell` if the load cell is that strut's.
+    `rows` are of `rows_between`; `with_cell` if the load cell is that strut's. The last cycle of
+    the estimate is a line.
     """
     columns = follower.columns
     force = _column(rows, columns, ESTIMATED_FORCE.column_of(strut))
     cell = _column(rows, columns, LOAD_CELL.column_of(strut))
+    last = _last_cycle(_column(rows, columns, f"{strut}.velocity_m_per_s"))
     points: dict[str, list[list[float]]] = {}
     for name in MOTION_COLUMNS:
         motion = _column(rows, columns, f"{strut}.{name}")
         points[f"{name}:{ESTIMATED_FORCE.origin}"] = _points(motion, force)
         points[f"{name}:{LOAD_CELL.origin}"] = _points(motion, cell) if with_cell else [[], []]
+        points[f"{name}:recent"] = [_numbers(motion[last]), _numbers(force[last])]
     return points
+
+
+def _last_cycle(velocity: Array) -> NDArray[np.intp]:
+    """Cycles of the bridge in the last cycle of a motion, thinned; none where it does not return.
+
+    A cycle lies between two beginnings of rebound, each after a compression of a tenth of the
+    largest speed: noise at a turning point begins none.
+    """
+    known = np.flatnonzero(np.isfinite(velocity))
+    if not len(known):
+        return known
+    v = velocity[known]
+    least = 0.1 * float(np.abs(v).max())
+    sides = np.where(v > least, 1, np.where(v < -least, -1, 0))
+    clear = np.flatnonzero(sides)
+    begins = clear[1:][(sides[clear[1:]] == 1) & (sides[clear[:-1]] == -1)]
+    if len(begins) < 2:
+        return known[:0]
+    cycle = known[begins[-2] : begins[-1] + 1]
+    return cycle[:: max(1, len(cycle) // _CYCLE_POINTS)]
 
 
 def laws(

@@ -42,14 +42,15 @@ def quantity(value: float, unit: str) -> str:
     factor, name = scale_of(abs(value), unit)
     scaled = value * factor
     if scaled == 0.0:
-        return _with_unit("0", unit)
+        return with_unit("0", unit)
     if not 1e-3 <= abs(scaled) < 1e7:
-        return _with_unit(f"{scaled:.2e}".replace("-", _MINUS), name)
+        return with_unit(f"{scaled:.2e}".replace("-", _MINUS), name)
     decimals = 2 - math.floor(math.log10(abs(scaled)))
-    return _with_unit(number(scaled, decimals), name)
+    return with_unit(number(scaled, decimals), name)
 
 
-def _with_unit(text: str, unit: str) -> str:
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit, which no line break separates."""
     return f"{text}{_NO_BREAK}{unit}" if unit else text
 
 
@@ -73,7 +74,7 @@ def value_and_interval(estimate: Estimate, unit: str) -> tuple[str, str]:
     if not -7 < decimals < 7:
         return plain, f"{quantity(low, unit)} to {quantity(high, unit)}"
     value, low_text, high_text = (number(x * factor, decimals) for x in (estimate.value, low, high))
-    return _with_unit(value, name), f"{low_text} to {_with_unit(high_text, name)}"
+    return with_unit(value, name), f"{low_text} to {with_unit(high_text, name)}"
 
 
 def ratio(value: float, reference: float) -> str:
