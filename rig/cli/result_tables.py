@@ -13,26 +13,8 @@ if TYPE_CHECKING:
     from rig.diagnosis.outcome import Diagnosis
     from rig.run.logged_run import Ended
 
-_OF_RUN = {
-    "lost": "frames lost (by their counters)",
-    "saturated": "frames sent with a value at the limit of its range",
-    "stale": "ticks in HOLD",
-    "limited": "ticks beyond a limit",
-    "bus_faulty": "ticks with a fault of the bus",
-    "left_out": "ticks without a further sensor",
-    "device_faulty": "ticks with a device at fault",
-}
-"""Counts in the table of a run, apart from refused frames and missed ticks, with their labels."""
-
-
-_MEANING = {
-    "untimed": ": sample time not known",
-    "no_value": ": the sensor states no value",
-    "implausible": ": beyond a limit",
-    "masquerade": ": CRC of another message",
-    "second_sender": ": from another sender",
-}
-"""Causes of refusals whose names do not say it."""
+_IN_OWN_ROW = ("overruns", "refused")
+"""Counts that have a row of the table of a run already."""
 
 
 def print_case(case: "Case") -> None:
@@ -122,20 +104,23 @@ def _modes(ended: "Ended") -> str:
 
 def print_run(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
+    from rig.pages.mode_words import COUNT_WORDS
+
     counts = ended.state.counts
     missed = f"{counts.overruns}"
     if counts.overruns:
         missed += f" ({100.0 * counts.overruns / (ended.ticks + counts.overruns):.2g} %)"
     refused = "; ".join(
-        f"{name.replace('_', ' ')} {n}{_MEANING.get(name, '')}"
-        for name, n in counts.refusals.items()
+        f"{COUNT_WORDS[name].removeprefix('refused: ')} {n}" for name, n in counts.refusals.items()
     )
     rows: list[tuple[str, str | Text]] = [
         ("time in each mode", _modes(ended)),
-        ("ticks missed", missed),
+        (COUNT_WORDS["overruns"], missed),
         ("frames refused", f"{counts.refused}" + (f" ({refused})" if refused else "")),
     ]
-    for name, label in _OF_RUN.items():
+    for name, label in COUNT_WORDS.items():
+        if name in counts.refusals or name in _IN_OWN_ROW:
+            continue
         if (value := getattr(counts, name)) or name == "lost":
             rows.append((label, str(value)))
     if with_timing:

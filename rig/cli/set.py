@@ -10,7 +10,8 @@ from rig.cli.terminal import JsonFlag, print_json, print_text
 
 EXAMPLES = (
     "Examples: `rig set runs/7 observers.strut.proportional_n_per_m=2e5` · "
-    "`rig set runs/7 --acknowledge` · `rig set runs/7 --arm`"
+    "`rig set runs/7 --acknowledge` · `rig set runs/7 --arm` · "
+    '`rig set runs/7 --mark "valve opened"`'
 )
 
 
@@ -30,21 +31,26 @@ def set_command(
     disarm: Annotated[
         bool, typer.Option("--disarm", help="Disarm the bridge: no estimate is valid.")
     ] = False,
+    mark: Annotated[
+        str | None,
+        typer.Option("--mark", metavar="TEXT", help="Mark the present time in the run's events."),
+    ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Apply the change although `rig check` finds an error.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Change gains or limits of a run in progress, acknowledge a safe state, or arm the bridge."""
+    """Change gains or limits of a run in progress, acknowledge, arm, or mark a time."""
     from rig.run.change_requests import ask
     from rig.run.changed_settings import parse_assignments
     from rig.run.operator import user_name
 
     given = {"acknowledge": acknowledge, "arm": arm, "disarm": disarm}
     requests = [request for request, is_given in given.items() if is_given]
-    named = [*(f"--{request}" for request in requests), *(["KEY=VALUE"] if assignments else [])]
+    named = [f"--{request}" for request in requests]
+    named += ["--mark"] * (mark is not None) + ["KEY=VALUE"] * bool(assignments)
     if not named:
-        raise InputError("expected KEY=VALUE, --acknowledge, --arm or --disarm")
+        raise InputError("expected KEY=VALUE, --acknowledge, --arm, --disarm or --mark")
     if len(named) > 1:
         raise InputError(f"{' and '.join(named)}: expected one of them")
     if requests:
@@ -53,6 +59,13 @@ def set_command(
             print_json({"requested": requests[0]})
         else:
             print_text(f"Requested: {requests[0]}.")
+        return
+    if mark is not None:
+        marked = ask(run, {"mark": mark, "by": user_name()}).get("marked", mark)
+        if as_json:
+            print_json({"marked": marked})
+        else:
+            print_text(f"Marked: {marked}.")
         return
     found = ask(run, {"set": parse_assignments(assignments or ())}, force=force)
     since_s = found.get("t_ns", 0) * 1e-9

@@ -82,9 +82,11 @@ def make_band(events: Sequence[LoggedEvent], begin_s: float, end_s: float) -> li
     return stretches
 
 
-def list_events(events: Sequence[LoggedEvent]) -> tuple[list[ListedEvent], int]:
+def list_events(
+    events: Sequence[LoggedEvent], *, with_strut: bool = True
+) -> tuple[list[ListedEvent], int]:
     """The first events of a run in words, and how many more there are."""
-    listed = [_in_words(event) for event in events[:_MOST_LISTED]]
+    listed = [_in_words(event, with_strut=with_strut) for event in events[:_MOST_LISTED]]
     return listed, max(0, len(events) - _MOST_LISTED)
 
 
@@ -93,20 +95,26 @@ def _piece_at(t_s: float, begin_s: float, end_s: float) -> int:
     return min(max(int(share * _PIECES), 0), _PIECES - 1)
 
 
-def _in_words(event: LoggedEvent) -> ListedEvent:
+def _in_words(event: LoggedEvent, *, with_strut: bool) -> ListedEvent:
     t_s = float(str(event["t_s"]))
     if "request" in event:
         refused = ", refused" if event.get("refused") else ""
         return ListedEvent(t_s, f"{event['request']}{refused}", f"by {event.get('by')}")
+    if "mark" in event:
+        return ListedEvent(t_s, f"“{event['mark']}”", f"by {event.get('by')}")
     if "to" in event:
-        return ListedEvent(t_s, f"{event.get('from')} → {event['to']}", _cause_in_words(event))
+        return ListedEvent(
+            t_s,
+            f"{event.get('from')} → {event['to']}",
+            _cause_in_words(event, with_strut=with_strut),
+        )
     others = {key: value for key, value in event.items() if key not in ("t_s", "machine")}
     why = ", ".join(f"{key} {value}" for key, value in others.items())
     return ListedEvent(t_s, str(event.get("machine", "")).replace("_", " "), why)
 
 
-def _cause_in_words(event: LoggedEvent) -> str:
-    words, first = describe_cause(event), event.get("first_cause")
+def _cause_in_words(event: LoggedEvent, *, with_strut: bool) -> str:
+    words, first = describe_cause(event, with_strut=with_strut), event.get("first_cause")
     if isinstance(first, dict):
-        words += f"; at first: {describe_cause(cast('LoggedEvent', first))}"
+        words += f"; at first: {describe_cause(cast('LoggedEvent', first), with_strut=with_strut)}"
     return words

@@ -1,4 +1,4 @@
-"""Modes of the bridge and their causes in words, for the page, the reports and the terminal."""
+"""Modes, causes and counts of a run in words, for the page, the reports and the terminal."""
 
 import math
 from collections.abc import Mapping
@@ -80,6 +80,30 @@ _QUANTITIES: Mapping[str, tuple[str, str]] = {
 """Quantities of causes and limits, with their units in SI."""
 
 
+COUNT_WORDS: Mapping[str, str] = {
+    "overruns": "cycles missed",
+    "lost": "frames lost (by their counters)",
+    "saturated": "frames sent with a value at the limit of its range",
+    "stale": "ticks in HOLD",
+    "limited": "ticks beyond a limit",
+    "bus_faulty": "ticks with a fault of the bus",
+    "left_out": "ticks without a further sensor",
+    "device_faulty": "ticks with a device at fault",
+    "refused": "frames refused",
+    "wrong_crc": "refused: wrong CRC",
+    "wrong_length": "refused: wrong length",
+    "repeated": "refused: repeated",
+    "out_of_sequence": "refused: out of sequence",
+    "masquerade": "refused: CRC of another message",
+    "implausible": "refused: beyond a limit",
+    "second_sender": "refused: from another sender",
+    "from_faulty_device": "refused: device at fault",
+    "no_value": "refused: the sensor states no value",
+    "untimed": "refused: sample time not known",
+}
+"""Counts of a run (`rig.bridge.counts.Counts`) in words, in the order in which they are shown."""
+
+
 def name_quantity(key: str) -> tuple[str, str]:
     """Words and unit of a limited quantity; of a channel's the channel and no unit."""
     if key in _QUANTITIES:
@@ -115,8 +139,9 @@ _WITH_VALUE = frozenset(
 
 def _is_within(value: object, limit: object) -> bool:
     """Whether a value has returned within its limit, which counts as passed for some time yet."""
-    both = isinstance(value, int | float) and isinstance(limit, int | float)
-    return both and abs(value) < abs(limit) and value * limit >= 0.0
+    if not (isinstance(value, int | float) and isinstance(limit, int | float)):
+        return False
+    return abs(value) < abs(limit) and value * limit >= 0.0
 
 
 def _amount(value: object, unit: str) -> str:

@@ -37,7 +37,7 @@ class PlottedQuantity(NamedTuple):
 TIME = PlottedQuantity("time", "s", "s")
 FREQUENCY = PlottedQuantity("frequency", "Hz", "Hz")
 HEIGHT = PlottedQuantity("height", "m", "mm", 1e3, 1e-3)
-HEIGHT_ERROR = PlottedQuantity("height error (innovation)", "m", "mm", 1e3, 2e-5)
+HEIGHT_ERROR = PlottedQuantity("height error", "m", "mm", 1e3, 2e-5)
 VELOCITY = PlottedQuantity("velocity", "m/s", "m/s", 1.0, 1e-2)
 FORCE = PlottedQuantity("force", "N", "N", 1.0, 2.0)
 STRUT_FORCE = PlottedQuantity("strut force", "N", "N", 1.0, 2.0)

@@ -7,16 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
+from rig.bridge.values import Mode
 from rig.log.checksums import Damage, find_damage, refuse_damage
-from rig.log.follower import RunFollower
+from rig.log.follower import FORCE_ERROR, RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
 from rig.pages.mode_band import list_events, make_band, read_events
+from rig.pages.mode_words import COUNT_WORDS, LoggedEvent, describe_cause
+from rig.pages.number_formats import number, percent, quantity
 from rig.pages.plotted_quantities import (
+    LOAD_CELL,
     TICK_CURVES,
     TICK_TIME,
     TIME,
     TIME_PLOTS,
+    VIRTUAL_FORCE_PLOT,
     Origin,
 )
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
@@ -46,7 +51,10 @@ _STATUS = {
     "failed": ("bad", "✕", "Failed"),
 }
 _KILLED = ("part", "◐", "Killed, or still running")
-_NOT_ALWAYS_VALID = ("part", "◐", "Ended in order, and was not valid all the time")
+_NOT_ALWAYS_VALID = ("part", "◐", "Ended in order, not valid all the time")
+_MOST_COMPARED = 3_600_000
+"""Cycles at the end of a run over which the force error is computed: an hour at 1 kHz."""
+
 _LOST_MODES = ("HOLD", "SAFE")
 
 
@@ -69,7 +77,7 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
     ending = header.get("ending") or {}
     tone, sign, badge = _badge(ending)
     events = read_events(folder)
-    listed, further = list_events(events)
+    listed, further = list_events(events, with_strut=len(struts) > 1)
     text = render_report(
         "run.html",
         name=folder.resolve().name,
@@ -77,6 +85,8 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
         tone=tone,
         sign=sign,
         badge=badge,
+        accuracy=_accuracy(follower),
+        cause=_cause_of_end(events, ending, with_strut=len(struts) > 1),
         headline=_headline(header, follower, ending) + _lost(damage),
         band=make_band(events, *follower.span_s),
         span_s=follower.span_s,
@@ -85,6 +95,7 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
         start=np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]"),
         header=header,
         ending=ending,
+        number=number,
         duration_s=follower.span_s[1] - follower.span_s[0],
         steps=follower.steps,
         counts=_counts(ending),
@@ -106,6 +117,35 @@ def _badge(ending: Ending) -> tuple[str, str, str]:
     if status == "done" and (lost_s or ending.get("dropped_steps")):
         return _NOT_ALWAYS_VALID
     return _STATUS.get(status, _KILLED)
+
+
+def _accuracy(follower: RunFollower) -> str:
+    """How far the valid estimates were from the load cell, as a sentence."""
+    if LOAD_CELL.column not in follower.columns:
+        return "No load cell was logged: the accuracy of the estimated force is not known."
+    rows = follower.rows(max(0, follower.steps - _MOST_COMPARED), follower.steps)
+    error, cell = (
+        rows[:, follower.columns.index(name)] for name in (FORCE_ERROR, LOAD_CELL.column)
+    )
+    error = error[np.isfinite(error)]
+    if not len(error):
+        return "No valid estimate coincides with a sample of the load cell."
+    rms_n = float(np.sqrt(np.mean(error**2)))
+    peak_n = float(np.nanmax(np.abs(cell)))
+    share = f" ({percent(rms_n / peak_n, 1)} of the peak, {quantity(peak_n, 'N')})" * (peak_n > 0)
+    return f"Estimated force within {quantity(rms_n, 'N')} RMS{share} of the load cell."
+
+
+def _cause_of_end(events: Sequence[LoggedEvent], ending: Ending, *, with_strut: bool) -> str:
+    """When and why a run entered the safe state in which it ended; empty where it did not."""
+    if ending.get("status") != "safe":
+        return ""
+    last = next((it for it in reversed(events) if it.get("to") == Mode.SAFE.name), None)
+    if last is None:
+        return ""
+    return (
+        f"SAFE at {float(str(last['t_s'])):.1f} s: {describe_cause(last, with_strut=with_strut)}."
+    )
 
 
 def _modes(ending: Ending) -> str:
@@ -130,19 +170,15 @@ def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     text = f"{end_s - begin_s:.1f} s at {rate_hz} Hz"
     if not ending:
         return f"{text}; its end is not recorded."
-    counts = dict(_counts(ending))
-    missed = counts.pop("overruns", 0)
-    faults = ", ".join(f"{count} {name}" for name, count in counts.items())
-    return (
-        f"{text}, {missed or 'no'} ticks missed; counted: {faults or 'no fault'}.{_modes(ending)}"
-    )
+    faults = "; ".join(f"{count} {name}" for name, count in _counts(ending))
+    return f"{text}; {faults or 'no faults'}.{_modes(ending)}"
 
 
 def _counts(ending: Ending) -> list[tuple[str, int]]:
-    """Faults that occurred, with their counts, the most frequent first."""
+    """Faults that occurred in words, with their counts, the most frequent first."""
     counts = ending.get("counts") or {}
     occurred = [
-        (name.replace("_", " "), count)
+        (COUNT_WORDS.get(name, name.replace("_", " ")), count)
         for name, count in counts.items()
         if count > 0 and name != "started"
     ]
@@ -157,11 +193,12 @@ def _timing(ending: Ending) -> list[tuple[str, dict[str, float]]]:
 
 def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> list[Plot]:
     """Plots of a strut over the time of a run; `is_only` if the model has no other strut."""
-    columns = [curve.column_of(strut) for item in TIME_PLOTS for curve in item.curves]
+    shown = (*TIME_PLOTS, VIRTUAL_FORCE_PLOT)
+    columns = [curve.column_of(strut) for item in shown for curve in item.curves]
     window = follower.window(columns, *follower.span_s, _POINTS)
     values = dict(zip(columns, window.values, strict=True))
     panels: list[Panel] = []
-    for item in TIME_PLOTS:
+    for item in shown:
         styles, curves = list[LineStyle](), list[NDArray[np.float64]]()
         for curve in item.curves:
             column = values[curve.column_of(strut)]
@@ -169,11 +206,14 @@ def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> l
                 colour, width = _STYLES[curve.origin]
                 styles.append(LineStyle(curve.label, colour, (), width))
                 curves.append(column * item.quantity.factor)
+        if not curves:
+            continue
         labels = TIME.label, item.quantity.label
         panels.append(Panel("lines", *labels, window.t_s, styles, curves, {"gaps": True}))
     caption = (
-        "Thinned by minimum and maximum: no peak is lost. The virtual force is what the model "
-        "lacks; the innovation is measured less predicted height."
+        "Thinned by minimum and maximum: no peak is lost. The height error (innovation) is the "
+        "measured less the predicted height, the force error is the estimated force less that of "
+        "the load cell while the estimate is valid; the virtual force is what the model lacks."
     )
     return [plot(f"run-{index}", "The run", caption, panels, 1)]
 

@@ -1,4 +1,4 @@
-"""Requests to a run in progress, through its folder: gains, limits, acknowledgement, arming.
+"""Requests to a run in progress, through its folder: gains, limits, acknowledgement, markers.
 
 Whoever may write into the folder may ask; nothing listens on a network. A request is a file, which
 a thread of the run reads, checks and answers with another; the loop only takes what is ready.
@@ -10,6 +10,7 @@ import os
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import TypedDict, cast
@@ -51,20 +52,24 @@ _ANSWER_S = 5.0
 """Longest wait for an answer: many looks, and a tick of the slowest rate that is of use."""
 
 _MOST_BYTES = 100_000
-_LONGEST_NAME = 100
-"""Characters of a name that stand in the run's events."""
+_LONGEST_NAME, _LONGEST_MARK = 100, 200
+"""Characters of a name, and of a marker's text, that stand in the run's events."""
 
 
 class Answer(TypedDict, total=False):
-    """`t_ns` of the first tick with the change, or what was `requested`; or `error`."""
+    """`t_ns` of the first tick with the change, or what was `requested` or `marked`; or `error`."""
 
     t_ns: int
     requested: str
+    marked: str
     error: str
 
 
 class Requests:
-    """The requests to a run; a change is logged, and the thread follows the loop's priority."""
+    """The requests to a run; changes and markers are logged by a function for each.
+
+    The thread follows the loop's priority.
+    """
 
     def __init__(
         self,
@@ -72,25 +77,31 @@ class Requests:
         plan: Plan,
         bridge: Bridge,
         ask_bridge: Callable[[Request, str], None],
-        log: Callable[[str], None],
+        log_change: Callable[[str], None],
+        log_event: Callable[[str], None],
         priority: int,
     ) -> None:
         self._folder = folder / _FOLDER
         self._plan, self._bridge = plan, bridge
-        self._ask_bridge, self._log = ask_bridge, log
+        self._ask_bridge = ask_bridge
+        self._log_change, self._log_event = log_change, log_event
         self._priority = priority
         self._waiting: tuple[Bridge, Assignments] | None = None
+        self._marks: deque[tuple[str, str]] = deque()
         self._taken_ns = 0
         self._taken = threading.Event()
         self._ended = threading.Event()
 
     def changes(self, t_ns: int) -> Bridge | None:
         """The bridge from this tick on, if a change is ready; called by the loop."""
+        while self._marks:
+            text, by = self._marks.popleft()
+            self._log_event(json.dumps({"t_s": t_ns * 1e-9, "mark": text, "by": by}) + "\n")
         waiting = self._waiting
         if waiting is None:
             return None
         bridge, assignments = waiting
-        self._log(change_line(t_ns, assignments))
+        self._log_change(change_line(t_ns, assignments))
         self._waiting, self._taken_ns = None, t_ns
         self._taken.set()
         return bridge
@@ -130,6 +141,8 @@ class Requests:
             if "request" in content:
                 by = str(content["by"])[:_LONGEST_NAME]
                 return self._pass_on(Request(content["request"]), by)
+            if "mark" in content:
+                return self._mark(str(content["mark"]), str(content["by"]))
             return self._change(path, dict(content["set"]))
         except InputError as error:
             return {"error": str(error)}
@@ -144,6 +157,13 @@ class Requests:
             )
         self._ask_bridge(request, by)
         return {"requested": request.value}
+
+    def _mark(self, text: str, by: str) -> Answer:
+        text = text.strip()[:_LONGEST_MARK]
+        if not text:
+            raise InputError("mark: is empty, expected a text")
+        self._marks.append((text, by[:_LONGEST_NAME]))
+        return {"marked": text}
 
     def _change(self, path: Path, assignments: Assignments) -> Answer:
         plan = assign(self._plan, assignments, "set")
@@ -163,9 +183,9 @@ class Requests:
 def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> Answer:
     """Send a request to a running run, and wait for its answer.
 
-    It contains ``{"set": assignments}``, or ``{"request": "acknowledge"}`` (or ``arm``, ``disarm``)
-    with the name of who makes it ``by``; `force` sends it although the check of the changed
-    configuration finds an error.
+    It contains ``{"set": assignments}``, ``{"request": "acknowledge"}`` (or ``arm``, ``disarm``) or
+    ``{"mark": text}``, the last two with the name of who makes it ``by``; `force` sends it although
+    the check of the changed configuration finds an error.
 
     Raises:
         InputError: It is no run, it has ended, the check finds an error, or it refuses.

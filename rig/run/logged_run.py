@@ -283,9 +283,15 @@ class _LoggedRun:
         operator = self._endpoint.operator
         if operator is None:
             return no_changes
-        note = partial(self._log.note, CHANGES_FILE)
+        log_change, log_event = (partial(self._log.note, it) for it in (CHANGES_FILE, EVENTS_FILE))
         requests = Requests(
-            self._folder, self._plan, self._bridge, operator.ask, note, self._priority
+            self._folder,
+            self._plan,
+            self._bridge,
+            operator.ask,
+            log_change,
+            log_event,
+            self._priority,
         )
         around.enter_context(requests.serve())
 

@@ -18,7 +18,7 @@ def test_the_stretches_are_the_modes_over_the_run():
     events = [change(0.0, "WAITING"), change(1.0, "SETTLING"), change(2.5, "RUNNING")]
     band = make_band(events, 0.0, 10.0)
     assert [(it.mode, it.tone) for it in band] == [
-        ("WAITING", "idle"),
+        ("WAITING", "wait"),
         ("SETTLING", "part"),
         ("RUNNING", "good"),
     ]
@@ -55,18 +55,24 @@ def test_events_are_in_words_with_their_causes():
     events = [
         change(1.0, "HOLD", cause="stale", quantity="age_s", value=0.0101, limit=0.01),
         change(2.0, "SAFE", cause="beyond_safe", strut="front", first_cause=first),
+        {"t_s": 2.5, "mark": "valve opened", "by": "anna"},
         {"t_s": 3.0, "request": "acknowledge", "by": "anna", "refused": True},
         {"t_s": 4.0, "machine": "clock_set", "by_s": 3600.0},
     ]
     listed, further = list_events(events)
     assert [(it.what, it.why) for it in listed] == [
-        ("INIT → HOLD", "stale, age_s 0.0101 (limit 0.01)"),
-        ("INIT → SAFE", "beyond safe, strut front, first cause: stale"),
+        ("INIT → HOLD", "no valid measurement for 10.1\u00a0ms (limit 10\u00a0ms)"),
+        (
+            "INIT → SAFE",
+            "a limit was passed, strut front; at first: "
+            "no valid measurement for 10.1\u00a0ms (limit 10\u00a0ms)",
+        ),
+        ("“valve opened”", "by anna"),
         ("acknowledge, refused", "by anna"),
         ("clock set", "by_s 3600.0"),
     ]
     assert further == 0
-    assert list_events(events * 100)[1] == 200
+    assert list_events(events * 100)[1] == 300
 
 
 def test_lines_that_are_cut_off_or_wrong_are_left_out(tmp_path):

@@ -56,8 +56,9 @@ def test_what_is_no_assignment_is_one_line(text):
         parse_assignments([text])
 
 
-def served(folder, ready, lines):
-    return Requests(folder, ready, build_bridge(ready), lambda: None, lines.append, 0)
+def served(folder, ready, lines, events=None):
+    note = ([] if events is None else events).append
+    return Requests(folder, ready, build_bridge(ready), lambda: None, lines.append, note, 0)
 
 
 def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready):
@@ -107,6 +108,19 @@ def test_what_nobody_waits_for_any_more_is_not_done(tmp_path, ready):
     assert requests.changes(5) is None
     assert lines == []
     assert "withdrawn" in answers[0]["error"]
+
+
+def test_a_marker_is_an_event_at_the_next_tick(tmp_path, ready):
+    path, events = tmp_path / "1.request", []
+    requests = served(tmp_path, ready, [], events)
+    path.write_text(json.dumps({"mark": " valve opened ", "by": "anna"}))
+    assert requests._answer(path) == {"marked": "valve opened"}
+    assert requests.changes(42_000_000) is None
+    assert requests.changes(43_000_000) is None
+    (line,) = events
+    assert json.loads(line) == {"t_s": 0.042, "mark": "valve opened", "by": "anna"}
+    path.write_text(json.dumps({"mark": "  ", "by": "anna"}))
+    assert "expected a text" in requests._answer(path)["error"]
 
 
 @pytest.mark.parametrize("content", ['{"set": [[1, 2]]}', "[" * 50_000, "{", '{"set": {"": 1}}'])

@@ -81,8 +81,8 @@ STATES: dict[str, tuple[int, Filtered, dict[str, object]]] = {
 """Length in ms, frames that arrive, supervision."""
 
 
-def make_state(folder: Path, name: str) -> Path:
-    """A run in a mode, without its ending."""
+def make_state(folder: Path, name: str, *, ended: bool = False) -> Path:
+    """A run in a mode, without its ending unless it has ended."""
     length_ms, arrive, supervision = STATES[name]
     folder.mkdir(parents=True, exist_ok=True)
     config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
@@ -96,9 +96,10 @@ def make_state(folder: Path, name: str) -> Path:
     endpoint = Endpoint(BenchPort(bench, arrive, {}), VirtualClock(), LinkFigures())
     run = folder / name
     run_with_log(plan, build_bridge(plan), endpoint, run, RunControl())
-    header = yaml.safe_load((run / RUN_FILE).read_text())
-    header.pop("ending", None)
-    (run / RUN_FILE).write_text(yaml.safe_dump(header))
+    if not ended:
+        header = yaml.safe_load((run / RUN_FILE).read_text())
+        del header["ending"]
+        (run / RUN_FILE).write_text(yaml.safe_dump(header))
     return run
 
 

@@ -42,7 +42,8 @@ def test_the_page_is_whole_and_needs_no_other_host(server):
     assert "unsafe" not in headers["Content-Security-Policy"]
     assert b"http://" not in page
     assert b"https://" not in page
-    for name in ("uPlot.iife.js", "uPlot.min.css", "charts.js", "page.js", "page.css"):
+    scripts = ("uPlot.iife.js", "charts.js", "glance.js", "arrange.js", "page.js")
+    for name in (*scripts, "uPlot.min.css", "page.css"):
         assert name.encode() in page
         assert get(server, f"/{name}")[0] == 200 or name == "charts.css"
 
@@ -55,7 +56,7 @@ def test_the_columns_of_its_plots_are_the_log_s(server):
         for curve in table["curves"]
     ]
     # A bench that sends no force of a load cell has no such column.
-    plotted = {*names, *table["state"]["columns"]} - {"strut_force_n"}
+    plotted = {*names, *table["band"]["columns"]} - {"strut_force_n", "force_error_n"}
     assert plotted <= set(described(server)[0]["columns"])
 
 

@@ -67,7 +67,8 @@ const Charts = (() => {
       if (y[i] !== null && y[i] !== undefined) places.push(u.valToPos(x[i], "x", true));
     }
     const steps = places.slice(1).map((place, i) => place - places[i]).sort((a, b) => a - b);
-    const usual = steps[Math.floor(steps.length / 2)] ?? 0;
+    // Thinned curves have pairs of values: the longer step is the one between two samples.
+    const usual = steps[Math.floor(0.75 * steps.length)] ?? 0;
     return gaps.filter(([from, to]) => to - from > MISSING * usual);
   }
 

@@ -2,7 +2,7 @@
 
 from rig.bridge.values import Mode
 from rig.pages.html import render
-from rig.pages.mode_words import TONES
+from rig.pages.mode_words import COUNT_WORDS, TONES
 from rig.pages.plotted_quantities import (
     ESTIMATED_FORCE,
     FAULT_COLUMNS,
@@ -48,6 +48,7 @@ def _table() -> dict[str, object]:
             "estimated": ESTIMATED_FORCE.label,
             "measured": LOAD_CELL.label,
         },
+        "counts": dict(COUNT_WORDS),
         "spectrum": {"frequency": FREQUENCY._asdict(), "label": VIRTUAL_FORCE_CURVE.label},
         "ticks": {"time": TICK_TIME.label, "time_unit": TICK_TIME.unit, "curves": TICK_CURVES},
     }

@@ -174,7 +174,7 @@ function build() {
     series: runs.map((run, i) => ({ label: several ? run.name : spectrum.label, unit: density, colour: several ? COLOURS[i % 4] : "--virtual", spanGaps: true })),
   });
   charts.timing = Charts.lines(at("timing"), {
-    xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "cycles", logX: true, logY: true,
+    xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "ticks", logX: true, logY: true,
     series: ticks.curves.map((label, i) => ({ label, colour: ["--virtual", "--estimated"][i], paths: Charts.steps })),
   });
   Glance.build(TABLE.plots, limitsOf, unitOf);
@@ -215,7 +215,7 @@ function draw(found) {
   const withCell = runs[0].columns.includes("force_error_n");
   Glance.tiles({ ...first.head.latest, withCell }, TABLE.band.modes[first.head.latest.mode]?.[0], first.t, lists, view.begin, view.end);
   const steps = found.reduce((sum, item) => sum + item.head.steps, 0);
-  at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${Charts.fixed(steps, 0)} cycles`;
+  at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${Charts.fixed(steps, 0)} ticks`;
   document.body.dataset.end = first.head.span_s[1];
   document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
 }
@@ -265,7 +265,7 @@ function figures(found) {
     }
     if (item.timing) rows.push([`${name}longest gap`, `${Charts.fixed(item.timing.longest_gap_us / 1000, 2)} ms`]);
     const counts = Object.entries(runs[i].counts ?? {}).filter(([key, value]) => value > 0 && key !== "started");
-    for (const [key, value] of counts) rows.push([`${name}${COUNTED[key] ?? key.replaceAll("_", " ")}`, Charts.fixed(value, 0)]);
+    for (const [key, value] of counts) rows.push([`${name}${TABLE.counts[key] ?? key.replaceAll("_", " ")}`, Charts.fixed(value, 0)]);
     if (runs[i].counts && counts.length === 0) rows.push([`${name}faults`, "no faults"]);
     if (runs[i].diverged) rows.push([`${name}diverged`, `${runs[i].diverged.strut}, ${runs[i].diverged.t_s.toFixed(3)} s`]);
   });
@@ -277,8 +277,6 @@ function figures(found) {
     }),
   );
 }
-
-const COUNTED = { overruns: "cycles missed", stale: "cycles in HOLD", lost: "frames lost", refused: "frames refused" };
 
 // Events of the runs, the newest first; a click shows the second about one.
 function events(found) {
@@ -477,7 +475,7 @@ async function demand(action, run, content) {
 async function change(content) {
   const found = await demand("set", runs.findIndex((item) => item.state === "live"), content);
   at("answer").className = found.error ? "bad" : "good";
-  at("answer").textContent = found.error ?? (found.requested ? `Requested: ${found.requested}.` : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
+  at("answer").textContent = found.error ?? (found.marked ? `Marked: ${found.marked}.` : found.requested ? `Requested: ${found.requested}.` : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
 }
 
 at("change").addEventListener("submit", (event) => {
@@ -489,6 +487,10 @@ at("change").addEventListener("submit", (event) => {
     return;
   }
   change({ set: { [at("key").value]: value } });
+});
+at("mark").addEventListener("submit", (event) => {
+  event.preventDefault();
+  change({ mark: at("mark-text").value });
 });
 for (const request of ["acknowledge", "arm", "disarm"]) {
   at(request).addEventListener("click", () => change({ request }));

@@ -450,6 +450,7 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
         # With several struts the log does not say whose force the cell measured.
         is_only = run.model is not None and len(run.model.struts) == 1
         models = {"model": run.model} if run.model is not None else {}
+        events, _ = list_events(run.events, with_strut=not is_only)
         return _json(
             {
                 "longest_s": visible_stretch.LONGEST_S,
@@ -460,7 +461,9 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
                     run.folder, run.epoch_ns or 0, run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
-                "events": [event._asdict() for event in list_events(run.events)[0]],
+                "events": [
+                    event._asdict() for event in list_events(run.events, with_strut=not is_only)[0]
+                ],
             }
         )
 
@@ -499,7 +502,8 @@ _Body = dict[str, Any]
 
 
 def _set(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
-    return ask(query.run(view).folder, {**body, "by": "page"} if "request" in body else body)
+    of_page = {"by": "page"} if {"request", "mark"} & body.keys() else {}
+    return ask(query.run(view).folder, {**body, **of_page})
 
 
 def _diagnose(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
