@@ -461,9 +461,7 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
                     run.folder, run.epoch_ns or 0, run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
-                "events": [
-                    event._asdict() for event in list_events(run.events, with_strut=not is_only)[0]
-                ],
+                "events": [event._asdict() for event in events],
             }
         )
 
