@@ -147,6 +147,8 @@ class HeldOut:
         strut_force_rmse_n: Against the load cell, where there is one.
         runs: Each run.
         source: ``runs``, or ``blocks`` where no run was held out and blocks of the recordings were.
+        linear_height_rmse_m: `height_rmse_m` of the best linear model, without any further effect.
+        linear_residual_force_rmse_n: `residual_force_rmse_n` of that model.
     """
 
     height_rmse_m: BeforeAfter
@@ -154,6 +156,8 @@ class HeldOut:
     strut_force_rmse_n: BeforeAfter | None
     runs: tuple[RunFigures, ...]
     source: Literal["runs", "blocks"]
+    linear_height_rmse_m: float = math.nan
+    linear_residual_force_rmse_n: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from rig.diagnosis.outcome import (
     NoiseFloor,
     RejectedEffect,
     Result,
+    RunFigures,
     Verdict,
     White,
 )
@@ -335,7 +336,15 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
         quadratic_means(cells) if cells else None,
         tuple(figures),
         "blocks" if by_blocks else "runs",
+        np.nan
+        if any(map(_is_prescribed, figures))
+        else quadratic_mean([it.linear for it in evaluations]),
+        quadratic_mean([it.linear_force_n for it in evaluations]),
     )
+
+
+def _is_prescribed(figures: RunFigures) -> bool:
+    return bool(np.isnan(figures.height_rmse_m.before))
 
 
 def _collect_series(

@@ -34,12 +34,14 @@ class LineStyle(NamedTuple):
         colour: Name of its colour in the page's style.
         dash: Lengths of dashes and gaps in px; none for a line without gaps.
         width: Width of the line in px.
+        is_line: Whether it is a line in a panel of points.
     """
 
     name: str
     colour: str
     dash: tuple[int, ...]
     width: float
+    is_line: bool = False
 
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -84,6 +86,7 @@ class Plot(NamedTuple):
         panels: Labels of the panels.
         columns: Number of panels in a row.
         json: Input of the page's script, safe inside a script element.
+        colour_scale: Text at both ends of a scale of colours; empty without one.
     """
 
     key: str
@@ -92,11 +95,64 @@ class Plot(NamedTuple):
     panels: Sequence[str]
     columns: int
     json: str
+    colour_scale: tuple[str, ...] = ()
 
 
 def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
     """Lines before and after, or of the nominal model alone where nothing was corrected."""
     return _BOTH if corrected else _BOTH[:1]
+
+
+def finding_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot | None:
+    """Residual force over the coordinate that shows it best, its correction and what is left.
+
+    The correction is the mean over the recordings at each height, or at each velocity.
+    """
+    joined = _residuals(series)
+    there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
+    if len(there) < _BINS:
+        return None
+    before, after = joined.values[there, 2], joined.values[there, 3]
+    column, mean = max(
+        ((i, _mean_over(joined.values[there, i], before - after)) for i in (0, 1)),
+        key=lambda item: -float(np.mean((before - item[1]) ** 2)),
+    )
+    against = joined.values[there, column]
+    kept = cloud(against, np.column_stack([before, after]), points // 2)
+    kept = kept[np.argsort(against[kept], kind="stable")]
+    quantity = (HEIGHT, VELOCITY)[column]
+    styles = (
+        LineStyle("residual force before", "--before", (), 1.6),
+        LineStyle("left after the correction", "--after", (), 1.6),
+        LineStyle("correction, mean", "--law", (7, 4), 2.4, is_line=True),
+    )
+    panel = Panel(
+        "points",
+        quantity.label,
+        RESIDUAL_FORCE.label,
+        against[kept],
+        styles,
+        [before[kept], after[kept], mean[kept]],
+        {"reach": _finite(_reach_n(joined))},
+    )
+    caption = f"The force that the nominal model lacks, over {quantity.name} ({_SMOOTHED_BAND})."
+    return plot(key, "Residual force", caption, [panel], 1)
+
+
+_BINS = 60
+"""Bins of a mean over height or velocity: some hundred samples in each."""
+
+
+def _mean_over(against: Array, values: Array) -> Array:
+    """Mean of values in the bin of a coordinate that each is in, shape (N,)."""
+    low, high = float(against.min()), float(against.max())
+    bins = np.minimum(
+        (_BINS * (against - low) / max(high - low, 1e-300)).astype(np.intp), _BINS - 1
+    )
+    sums, counts = np.bincount(bins, values, _BINS), np.bincount(bins, minlength=_BINS)
+    centres = low + (np.arange(_BINS) + 0.5) * (high - low) / _BINS
+    filled = counts > 0
+    return np.interp(against, centres[filled], sums[filled] / counts[filled])
 
 
 def residual_plot(
@@ -114,7 +170,7 @@ def residual_plot(
     over_time = _over_time(
         joined, joined.values.T[2:4], shown, points, RESIDUAL_FORCE.label, _reach_n(joined)
     )
-    panels = [*_clouds(joined, shown, points), over_time, *_spectra(series, shown)]
+    panels = [*_clouds(joined, shown, points), over_time]
     caption = (
         "The force that would make the residual vanish, smoothed over the whole recording "
         f"({_SMOOTHED_BAND}). Friction steps with the sign of the velocity, a stop rises at one "
@@ -124,12 +180,25 @@ def residual_plot(
     return plot(key, "Residual force", caption, panels, 2)
 
 
+def spectrum_plot(
+    key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle]
+) -> Plot | None:
+    """Amplitude density of the residual force; None of recordings too short for one."""
+    panels = _spectra(series, shown)
+    caption = (
+        "Amplitude density of the residual force. Far below the peak, it shows the smoother's own "
+        "roll-off."
+    )
+    return plot(key, "Spectrum of the residual force", caption, panels, 1) if panels else None
+
+
 def corrected_residual_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot:
     """Residual force of the corrected model against height and velocity, at its own scale."""
     panels = _clouds(_residuals(series), _BOTH, points, first=1)
     caption = (
-        "The residual force after the correction, at its own scale: a pattern here is a force that "
-        f"is still missing, an even band is noise ({_SMOOTHED_BAND})."
+        "The residual force after the correction, at its own scale: an even band is noise, a pattern "
+        "is a force that the law does not describe, however small. The verdict depends on the error "
+        f"of the height ({_SMOOTHED_BAND})."
     )
     return plot(key, "Residual force of the corrected model", caption, panels, 2)
 
@@ -190,7 +259,9 @@ def surface_plot(
         f"{largest:.3g} N, red pulls them together. A cell is empty where it holds fewer than "
         f"{mean.least_count} samples: the recordings hardly reach it."
     )
-    return plot(key, "Restoring-force surface", caption, panels, len(shown))
+    ends = tuple(f"{sign}{largest:.3g} N" for sign in ("\u2212", "+"))
+    drawn = plot(key, "Restoring-force surface", caption, panels, len(shown))
+    return drawn._replace(colour_scale=(ends[0], "0", ends[1]))
 
 
 def held_out_plot(
@@ -297,7 +368,9 @@ def _spectra(series: Sequence[FittedSeries], shown: Sequence[LineStyle]) -> list
     if highest > 0.0:
         # Far below the peak, a smoothed residual only shows the smoother's own roll-off.
         top = math.log10(highest) + 0.3
-        extra["y_range"] = [10.0 ** (top - _DECADES), 10.0**top]
+        peaks = [peak for density in densities if (peak := _largest(density)) > 0.0]
+        bottom = min(top - _DECADES, math.log10(min(peaks)) - 1.0)
+        extra["y_range"] = [10.0**bottom, 10.0**top]
     labels = FREQUENCY.label, RESIDUAL_DENSITY.label
     thin = [_thin(curve) for curve in shown]
     return [Panel("lines", *labels, mean.frequency_hz, thin, densities, extra)]

@@ -11,7 +11,7 @@ const PAPER = { whole: 690, half: 335, height: 205, low: 165 };
 function draw(element, panel) {
   const x = unpacked(panel.x, Float64Array);
   const values = panel.values.map((text) => unpacked(text));
-  const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points", spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
+  const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points" && !curve.is_line, spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
   const [name, unit] = panel.xLabel.split(" / ");
   const spec = { ...panel, series, xName: name, xUnit: unit };
   if (panel.kind === "cells") return Charts.cells(element, spec, x, unpacked(panel.y), values[0]);
@@ -31,6 +31,7 @@ for (const data of document.querySelectorAll("script[data-plot]")) {
   JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, element: elements[i], ...draw(elements[i], panel) }));
 }
 window.addEventListener("beforeprint", () => {
+  for (const folded of document.querySelectorAll("details")) folded.open = true;
   for (const { chart, half, element } of drawnPanels) {
     const height = element.classList.contains("low") ? PAPER.low : PAPER.height;
     chart.setSize({ width: half ? PAPER.half : PAPER.whole, height });
@@ -42,4 +43,21 @@ window.addEventListener("afterprint", () => {
 // A table that is wider than the screen is scrolled by keyboard too.
 for (const table of document.querySelectorAll("main table")) {
   if (table.scrollWidth > table.clientWidth) table.tabIndex = 0;
+}
+
+for (const button of document.querySelectorAll("button[data-copy]")) {
+  button.addEventListener("click", async () => {
+    const source = document.getElementById(button.dataset.copy);
+    const before = button.textContent;
+    try {
+      await navigator.clipboard.writeText(source.textContent);
+      button.textContent = "Copied";
+    } catch {
+      // Without permission, as from a file: the text is selected instead.
+      source.closest("details")?.setAttribute("open", "");
+      getSelection().selectAllChildren(source);
+      button.textContent = "Selected: copy it with Ctrl-C";
+    }
+    setTimeout(() => (button.textContent = before), 3000);
+  });
 }

@@ -3,8 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from dart_model.effects import FAMILY_WORDS, effect
-from rig.diagnosis.outcome import Diagnosis, Result
+from dart_model.spec import dump_model
+from rig.diagnosis.outcome import Diagnosis, FittedSeries, Result
 from rig.machine.installed_versions import version_of
 from rig.pages.html import render_report, write_page
 from rig.pages.number_formats import percent
@@ -14,10 +17,13 @@ from rig.pages.report.figures import (
     corrected_residual_plot,
     curves,
     damper_plot,
+    finding_plot,
     held_out_plot,
     residual_plot,
+    spectrum_plot,
     surface_plot,
 )
+from rig.pages.report.finding import find
 from rig.pages.report.series import check_series
 from rig.pages.report.words import BLOCKS, is_prescribed, sentence
 
@@ -84,6 +90,10 @@ def page(result: Result) -> str:
         struts=struts,
         is_corrected=_has_corrections(diagnosis),
         tables=tables,
+        found=find(result),
+        finding_plot=_finding_plot(result),
+        corrected=_corrected_text(result),
+        view_command=_view_command(result),
         nearest=next((item for item in diagnosis.rejected if item.left is not None), None),
         strut_plots=_plots(result, struts),
         assumptions=_ASSUMPTIONS + (() if is_prescribed(diagnosis) else _OF_A_FREE_RUN),
@@ -98,6 +108,31 @@ def page(result: Result) -> str:
 
 def _has_corrections(diagnosis: Diagnosis) -> bool:
     return bool(diagnosis.linear or diagnosis.effects or diagnosis.existing)
+
+
+def _finding_plot(result: Result) -> Plot | None:
+    """The residual force of the strut that lacks most, over the coordinate that shows it best."""
+    by_strut: dict[str, list[FittedSeries]] = {}
+    for series in result.fitted:
+        by_strut.setdefault(series.strut, []).append(series)
+    if not by_strut:
+        return None
+    lacking = {
+        strut: sum(float(np.nansum(it.residual_before_n**2)) for it in series)
+        for strut, series in by_strut.items()
+    }
+    return finding_plot("first", by_strut[max(lacking, key=lacking.__getitem__)], _POINTS)
+
+
+def _corrected_text(result: Result) -> str:
+    """The corrected model's file; empty where nothing was corrected."""
+    return dump_model(result.corrected) if _has_corrections(result.diagnosis) else ""
+
+
+def _view_command(result: Result) -> str:
+    """The command that shows the first run with the corrected model's law; empty without a run."""
+    runs = [item.name for item in result.sources if item.role == "fitted"]
+    return f"rig view {runs[0]} --model corrected.yaml" if runs else ""
 
 
 def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]], ...]:
@@ -118,5 +153,6 @@ def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]
                 plots.append(corrected_residual_plot(f"left-{index}", fitted, points))
             plots.append(damper_plot(f"damper-{index}", fitted, styles, points))
             plots.append(surface_plot(f"surface-{index}", fitted, styles))
+            plots.append(spectrum_plot(f"spectrum-{index}", fitted, styles))
         groups.append((strut, [plot for plot in plots if plot is not None]))
     return tuple(groups)

@@ -49,6 +49,42 @@ def errors(diagnosis: Diagnosis) -> tuple[Row, ...]:
     )
 
 
+class Bar(NamedTuple):
+    """A bar: its name, what it is (`given`, `chosen` or `rival`), and its share of the scale."""
+
+    name: str
+    kind: str
+    share: float
+
+
+_RIVALS = 3
+"""Nearest rivals that are drawn."""
+
+
+def bars(diagnosis: Diagnosis) -> tuple[Bar, ...]:
+    """Residual forces of nominal, best linear and chosen model and of the nearest rivals.
+
+    As shares of that of the best linear model; none where that is not known.
+    """
+    held_out = diagnosis.held_out
+    linear_n, force = held_out.linear_residual_force_rmse_n, held_out.residual_force_rmse_n
+    lacking = missing(diagnosis)
+    if not (linear_n > 0.0 and math.isfinite(force.after) and lacking):
+        return ()
+    rivals = [
+        Bar(effect(item.name).words, "rival", item.left)
+        for item in diagnosis.rejected
+        if item.left is not None
+    ][:_RIVALS]
+    words = " and ".join(effect(item.name).words for item in lacking)
+    return (
+        Bar("nominal model", "given", force.before / linear_n),
+        Bar("best linear model", "given", 1.0),
+        *rivals[::-1],
+        Bar(f"chosen: {words}", "chosen", force.after / linear_n),
+    )
+
+
 def run_columns(diagnosis: Diagnosis) -> Row:
     """Heads of the pairs of columns of `run_cells`."""
     return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(diagnosis) :]

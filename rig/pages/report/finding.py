@@ -1,0 +1,264 @@
+"""The first screen of a diagnosis: what was found, what it means, and how certain that is."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dart_model.effects import FAMILY_WORDS, Effect, effect
+from dart_model.effects.calling import force_over_arrays
+from rig.diagnosis.outcome import BeforeAfter, Diagnosis, FoundEffect, LinearCorrection, Result
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.pages.number_formats import (
+    decimals_of,
+    label,
+    number,
+    percent,
+    quantity,
+    times,
+    value_and_interval,
+    with_unit,
+)
+from rig.pages.report.words import LINEAR, is_prescribed, join_words, missing
+
+_NOT_USED = "on data not used for fitting"
+_POINTS = 121
+_SHARES = (1.0, 0.5)
+"""Of the way from mid-stroke (or from rest) to the end at which a law's force is stated."""
+
+_DIRECTIONS = {
+    "mass_kg": ("Mass", "larger", "smaller"),
+    "stiffness_n_per_m": ("Spring", "stiffer", "softer"),
+    "damping_n_s_per_m": ("Damping", "larger", "smaller"),
+    "preload_n": ("Preload", "larger", "smaller"),
+    "input_gain": ("Applied force", "larger", "smaller"),
+    "free_length_m": ("Free length", "longer", "shorter"),
+}
+
+
+class Statement(NamedTuple):
+    """A line about certainty: its tone, its sign, its text."""
+
+    tone: str
+    sign: str
+    text: str
+
+
+class Finding(NamedTuple):
+    """What the first screen states.
+
+    Attributes:
+        headline: What is missing, in few words.
+        values: Each value with its interval.
+        meaning: What the found laws amount to, in newtons; empty without a law that shows it.
+        error: The error before and after the correction.
+        certainty: Noise reached, rivals, load cell.
+    """
+
+    headline: str
+    values: tuple[str, ...]
+    meaning: tuple[str, ...]
+    error: str
+    certainty: tuple[Statement, ...]
+
+
+def find(result: Result) -> Finding:
+    """The first screen of a result."""
+    diagnosis = result.diagnosis
+    return Finding(
+        _headline(diagnosis),
+        _values(diagnosis),
+        tuple(text for item in missing(diagnosis) if (text := _meaning(result, item))),
+        _error(diagnosis),
+        (remainder(diagnosis), _rivals(diagnosis), _load_cell(diagnosis)),
+    )
+
+
+def remainder(diagnosis: Diagnosis) -> Statement:
+    """What is left after the correction: noise, or a part of the residual force."""
+    figure, floor = _deciding(diagnosis)
+    ratio = figure.after / floor if floor > 0.0 else math.inf
+    is_at_floor = ratio <= CRITERIA.explained
+    if diagnosis.verdict in ("explained", "nothing_missing") or (
+        diagnosis.verdict == "ambiguous" and is_at_floor
+    ):
+        return Statement("good", "✓", f"Only noise is left: {times(ratio)} times the noise floor.")
+    force = diagnosis.held_out.residual_force_rmse_n
+    share = percent(force.after / force.before, 1) if force.before > 0.0 else "–"
+    tone, sign = ("bad", "✕") if diagnosis.verdict == "not_explained" else ("part", "◐")
+    if is_at_floor:
+        if diagnosis.verdict == "ambiguous":
+            return Statement(
+                "good", "✓", f"Only noise is left: {times(ratio)} times the noise floor."
+            )
+        text = "On at least one run the error is above the noise: something is still missing."
+        return Statement(tone, sign, text)
+    above = f"{times(ratio)} times the noise floor" if math.isfinite(ratio) else "floor not known"
+    text = f"{share} of the residual force is left ({above}): something is still missing."
+    return Statement(tone, sign, text)
+
+
+def _deciding(diagnosis: Diagnosis) -> tuple[BeforeAfter, float]:
+    """The error that decides, and its noise floor."""
+    held_out, floor = diagnosis.held_out, diagnosis.noise_floor
+    if is_prescribed(diagnosis):
+        return held_out.residual_force_rmse_n, floor.residual_force_rmse_n
+    return held_out.height_rmse_m, floor.height_rmse_m
+
+
+def _headline(diagnosis: Diagnosis) -> str:
+    names = [effect(item.name).words for item in missing(diagnosis)]
+    match diagnosis.verdict:
+        case "nothing_missing":
+            return "Nothing is missing"
+        case "not_explained":
+            return "A force is missing that no law describes"
+        case "ambiguous":
+            rivals = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
+            either = join_words(names, "and") or "linear corrections"
+            others = join_words(rivals, "or") or "another law that fits as well"
+            return f"{_capital(either)}, or {others}"
+        case _:
+            pass
+    if names:
+        also = " and more" if diagnosis.verdict == "partly_explained" else ""
+        return f"{_capital(join_words(names, 'and'))}{also} missing"
+    parts = [_direction(item) for item in diagnosis.linear]
+    parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
+    more = "more is missing" if diagnosis.verdict == "partly_explained" else "no further effect"
+    return f"{_capital(join_words(parts, 'and') or 'parameters off')}; {more}"
+
+
+def _direction(item: LinearCorrection) -> str:
+    """A linear correction as “Spring 15 % stiffer than in the model”."""
+    name, more, less = _DIRECTIONS[item.parameter]
+    change = item.total.value - item.nominal
+    if item.parameter in ("preload_n", "free_length_m") or item.nominal == 0.0:
+        amount = quantity(abs(change), LINEAR[item.parameter][1])
+    else:
+        share = 100.0 * abs(change / item.nominal)
+        amount = with_unit(number(share, decimals_of(share) if share else 0), "%")
+    return f"{name} {amount} {more if change > 0.0 else less} than in the model"
+
+
+def _values(diagnosis: Diagnosis) -> tuple[str, ...]:
+    texts: list[str] = []
+    for item in missing(diagnosis):
+        law = effect(item.name)
+        for parameter in law.parameters:
+            if parameter.name in law.shown and parameter.name in item.parameters:
+                estimate = item.parameters[parameter.name]
+                value, interval = value_and_interval(estimate, parameter.unit)
+                texts.append(f"{_capital(label(parameter))} {value} (95 %: {interval})")
+    for item in diagnosis.linear:
+        value, interval = value_and_interval(item.total, LINEAR[item.parameter][1])
+        texts.append(f"{_direction(item)}: {value} (95 %: {interval})")
+    return tuple(texts)
+
+
+def _meaning(result: Result, item: FoundEffect) -> str:
+    """The force of a law where it is largest and half way there; of a state, its RMS."""
+    law = effect(item.name)
+    series = [it for it in result.fitted if it.strut == item.strut]
+    if not series or set(item.parameters) != {it.name for it in law.parameters}:
+        return ""
+    if law.states or law.adds_mass:
+        return f"{_capital(law.words)}: {quantity(item.force_rms_n, 'N')} RMS along the recordings."
+    heights = np.concatenate([it.height_m for it in series])
+    speeds = np.concatenate([it.velocity_m_per_s for it in series])
+    middle = 0.5 * (float(heights.min()) + float(heights.max()))
+    ends = [
+        [(float(h), 0.0) for h in np.linspace(heights.min(), heights.max(), _POINTS)],
+        [(middle, float(v)) for v in np.linspace(speeds.min(), speeds.max(), _POINTS)],
+    ]
+    forces = [[_force(law, item, result, *at) for at in points] for points in ends]
+    if not all(math.isfinite(force) for of in forces for force in of):
+        return ""
+    over_velocity = np.ptp(forces[1]) > np.ptp(forces[0])
+    unit, scale = ("m/s", 1.0) if over_velocity else ("mm", 1e3)
+    points, force = ends[over_velocity], forces[over_velocity]
+    largest = int(np.argmax(np.abs(force)))
+    centre = _POINTS // 2
+    texts: list[str] = []
+    for share in _SHARES:
+        at = centre + round(share * (largest - centre))
+        x = scale * points[at][int(over_velocity)]
+        texts.append(
+            f"{quantity(force[at], 'N')} at {with_unit(number(x, 2 - 2 * (unit == 'mm')), unit)}"
+        )
+    where = "" if over_velocity else " of height"
+    return f"{_capital(law.words)}: {', '.join(texts)}{where}."
+
+
+def _force(
+    law: Effect, item: FoundEffect, result: Result, height_m: float, velocity: float
+) -> float:
+    values = [item.parameters[parameter.name].value for parameter in law.parameters]
+    strut = next((it for it in result.corrected.struts if it.name == item.strut), None)
+    constants = (height_m, 0.0, 0.0, result.corrected.gravity_m_per_s2)
+    if strut is not None:
+        of_strut = strut.free_length_m, strut.stiffness_n_per_m, strut.damping_n_s_per_m
+        constants = (*of_strut, result.corrected.gravity_m_per_s2)
+    try:
+        return force_over_arrays(law)(0.0, height_m, velocity, 0.0, 20.0, (), values, constants)
+    except (ArithmeticError, ValueError):
+        return math.nan
+
+
+def _error(diagnosis: Diagnosis) -> str:
+    figure, _ = _deciding(diagnosis)
+    if not math.isfinite(figure.before):
+        return ""
+    if is_prescribed(diagnosis):
+        name, factor, unit = "Force error", 1.0, "N"
+    else:
+        name, factor, unit = "Height error", 1e3, "mm"
+    before, after = (_three(factor * it) for it in (figure.before, figure.after))
+    if diagnosis.verdict == "nothing_missing" and before == after:
+        return f"{name} {with_unit(before, unit)} {_NOT_USED}."
+    return f"{name} {before} → {with_unit(after, unit)} {_NOT_USED}."
+
+
+def _three(value: float) -> str:
+    """A number with three digits."""
+    return number(value, 2 - math.floor(math.log10(abs(value)))) if value else "0"
+
+
+def _rivals(diagnosis: Diagnosis) -> Statement:
+    tried = [item for item in diagnosis.rejected if item.left is not None]
+    if diagnosis.ambiguous_with:
+        rivals = join_words([FAMILY_WORDS[item] for item in diagnosis.ambiguous_with], "and")
+        return Statement("part", "?", f"{_capital(rivals)} cannot be told apart from it here.")
+    if diagnosis.verdict == "nothing_missing":
+        return Statement("good", "✓", "No law is needed for what these recordings excite.")
+    if not tried:
+        return Statement("part", "?", "No other law was tried.")
+    if not missing(diagnosis):
+        text = (
+            "No law reduces the error further."
+            if diagnosis.verdict == "explained"
+            else (f"None of {len(tried)} laws explains it.")
+        )
+        return Statement("good" if diagnosis.verdict == "explained" else "bad", "✓", text)
+    nearest = tried[0]
+    text = (
+        f"No rival of {len(tried)} fits as well; the nearest is {effect(nearest.name).words}, "
+        f"which leaves {percent(nearest.left, 0)} of the linear model's residual."
+    )
+    return Statement("good", "✓", text)
+
+
+def _load_cell(diagnosis: Diagnosis) -> Statement:
+    figure = diagnosis.held_out.strut_force_rmse_n
+    if figure is None or not math.isfinite(figure.after):
+        return Statement("idle", "–", "No load cell: the strut's force itself was not compared.")
+    before, after = quantity(figure.before, "N"), quantity(figure.after, "N")
+    if figure.after < figure.before:
+        text = f"The load cell agrees better: its difference falls from {before} to {after} RMS."
+        return Statement("good", "✓", text)
+    text = f"The load cell does not agree: its difference goes from {before} to {after} RMS."
+    return Statement("bad", "✕", text)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
