@@ -332,8 +332,11 @@ class FreeModelEstimator:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
                     return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
-                model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
-                height_m = measured.value
+                height_m, model_m = measured.value, model.struts[strut][0]
+                if measured_ns != t_ns:
+                    before_tick = Instant(before_ns, loaded.state.struts, ())
+                    ticks = instants or (Instant(t_ns, model.struts, ()), before_tick)
+                    model_m = model_height_m(measured_ns, strut, ticks)
                 innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
                 sensing, was_left = self._sensing[strut], band.is_left

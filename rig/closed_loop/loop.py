@@ -198,14 +198,14 @@ class Loop:
         ]
         return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
 
-    def linear(self, strut: int = 0) -> LinearLoop:
-        """The loop about a slow motion, as one strut's noise and residual force drive it."""
+    def linear(self, strut: int = 0, speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> LinearLoop:
+        """The loop about a motion at a speed, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
         step_n = _ACCELERATION_STEP_M_PER_S2 / self._responses[strut].mobility_per_kg
 
-        def slopes_at(speed_m_per_s: float) -> Array:
-            moving, bench_m = self._moving(speed_m_per_s)
+        def slopes_at(velocity_m_per_s: float) -> Array:
+            moving, bench_m = self._moving(velocity_m_per_s)
 
             def after(u: Array) -> Array:
                 noise_m, residual_n = u[size:].tolist()
@@ -215,7 +215,7 @@ class Loop:
 
             return central_differences(after, [*widths, _STEP, step_n])
 
-        slopes = 0.5 * (slopes_at(USUAL_SPEED_M_PER_S) + slopes_at(-USUAL_SPEED_M_PER_S))
+        slopes = 0.5 * (slopes_at(speed_m_per_s) + slopes_at(-speed_m_per_s))
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
 

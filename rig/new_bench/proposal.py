@@ -43,7 +43,7 @@ _UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
 _LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
 """Rates of the bridge: that of the height where it lies between, else the usual one."""
 
-_VALID_WORDS = ("valid", "gueltig", "qual", "ok", "healthy")
+_VALID_WORDS = ("valid", "vld", "gueltig", "qual", "ok", "healthy")
 _OK_CHOICES = ("ok", "valid", "good", "gueltig", "healthy")
 _WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
@@ -401,9 +401,9 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
 
 
 def _is_described_as_valid(signal: Signal) -> bool:
-    """Whether a comment says that 1 is the value of a sensor that works."""
+    """Whether a comment says that 1 is the value of something that works."""
     return (
-        re.match(rf"1\s*[:=]?\s*(?:sensor\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
+        re.match(rf"1\s*[:=]?\s*(?:\w+\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
         is not None
     )
 
