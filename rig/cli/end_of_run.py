@@ -87,9 +87,9 @@ def _print_validity(ended: "Ended") -> None:
     share = ended.ticks_in_mode.get(Mode.RUNNING, 0) / max(sum(ended.ticks_in_mode.values()), 1)
     if share < _LITTLE_VALID:
         print_text(
-            f"The estimate was valid in only {share:.0%} of the ticks. events.jsonl has the causes. "
-            "If it is unsettled again and again, the loop is not stable in this motion: `rig check` "
-            "and `rig tune` examine that.",
+            f"The estimate was valid in only {share:.0%} of the ticks; events.jsonl has the "
+            "causes. If it is unsettled again and again, the loop is not stable in this motion: "
+            "`rig check` and `rig tune` examine that.",
             "yellow",
         )
 
