@@ -325,8 +325,9 @@ class FreeModelEstimator:
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
         oldest_ns = t_ns
+        known = self._with_slopes(state.observers, model, applied_n, temperature_c)
         for strut, observer in enumerate(self.observers):
-            measured, before, band = received[strut], state.observers[strut], state.bands[strut]
+            measured, before, band = received[strut], known[strut], state.bands[strut]
             innovation = None
             if measured is not None:
                 measured_ns = measured.t_ns
@@ -368,6 +369,22 @@ class FreeModelEstimator:
             tuple(bands),
         )
         return self._estimate(after, loaded, oldest_ns)
+
+    def _with_slopes(
+        self,
+        states: Sequence[ObserverState],
+        model: ModelState,
+        applied_n: float,
+        temperature_c: float,
+    ) -> Sequence[ObserverState]:
+        """States of the observers, which know the slopes of the model's laws where it is now."""
+        slopes = self._plant.slopes(model, applied_n, temperature_c)
+        if slopes is None:
+            return states
+        return [
+            observer.with_slopes(state, *of_strut)
+            for observer, state, of_strut in zip(self.observers, states, slopes, strict=True)
+        ]
 
     def _begin_again(
         self, state: FreeModelState, step_input: StepInput, strut: int, band: InnovationBand
