@@ -14,7 +14,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal, alive_counter
 from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
-from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
+from rig.bridge.published_quantities import COUNTER, FORCE, STATUS_MESSAGE, VALID
 from rig.bus.bus import WITHOUT_BIT_RATE, BusConfig
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
@@ -450,6 +450,14 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
             "  # unsafe: {publish_without_valid: true} accepts that",
         ]
     )
+    if best.message.protection is None:
+        counters = [
+            it.name for it in best.message.signals.values() if _is_counter(best.message, it)
+        ]
+        lines += [
+            f"  {COUNTER.key}: {{message: {best.message.name}, signal: {name}}}"
+            for name in counters[:1]
+        ]
     state = _find_integer(near, _STATE_WORDS, lambda bits: bits >= _LEAST_STATE_BITS)
     if any(item.name == STATUS_MESSAGE for item in free):
         lines.append(f"status: {STATUS_MESSAGE}")
