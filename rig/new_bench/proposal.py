@@ -5,15 +5,16 @@ signal that marks the estimate as invalid, and limits on what a height sensor ca
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 from can_dbc.codec import si_step
-from can_dbc.database import Database, Message, Signal
-from can_dbc.errors import InputError, expected_name
+from can_dbc.database import Database, Message, Signal, alive_counter
+from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
-from rig.bridge.published_quantities import COUNTER, STATUS_MESSAGE
+from rig.bridge.published_quantities import COUNTER, FORCE, STATUS_MESSAGE, VALID
 from rig.bus.bus import WITHOUT_BIT_RATE, BusConfig
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
@@ -365,6 +366,91 @@ def _frame_checks(choice: Choice) -> dict[str, str]:
         name, value = valid
         found["valid"] = f"{{signal: {name}, value: {value}}}"
     if message.protection is None:
+        counters = [item for item in message.signals.values() if _is_counter(message, item)]
+        if len(counters) == 1:
+            found["counter"] = counters[0].name
+    return found
+
+
+def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
+    """A signal that says whether a message's values hold, with the value that says they do."""
+    flags = [
+        signal
+        for signal in message.signals.values()
+        if not signal.unit and not signal.is_float and signal.length_bits <= 2
+        if _has_word(signal, _VALID_WORDS)
+        or _is_described_as_valid(signal)
+        or _has_word(signal, _FAULT_WORDS)
+    ]
+    # The signal's own, or one that belongs to no other signal; a counter is of the whole message.
+    own = [item for item in flags if _shares_a_word(item.name, measured.name)]
+    others = [
+        item.name
+        for item in message.signals.values()
+        if item not in (*flags, measured) and not _is_counter(message, item)
+    ]
+    common = [it for it in flags if not any(_shares_a_word(it.name, other) for other in others)]
+    chosen = own or common
+    if len(chosen) != 1:
+        return None
+    (flag,) = chosen
+    for raw, text in flag.choices.items():
+        if any(text.lower().startswith(word) for word in _OK_CHOICES):
+            return flag.name, raw
+    return flag.name, 0 if _has_word(flag, _FAULT_WORDS) else 1
+
+
+def _is_described_as_valid(signal: Signal) -> bool:
+    """Whether a comment says that 1 is the value of something that works."""
+    return (
+        re.match(rf"1\s*[:=]?\s*(?:\w+\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
+        is not None
+    )
+
+
+def _shares_a_word(one: str, other: str) -> bool:
+    return bool(set(signal_ranking.split_name(one)) & set(signal_ranking.split_name(other)))
+
+
+def _has_word(signal: Signal, words: Sequence[str]) -> bool:
+    return any(word in signal.name.lower() for word in words)
+
+
+def _is_counter(message: Message, signal: Signal) -> bool:
+    if signal.unit or not _has_word(signal, _COUNTER_WORDS) or message.cycle_time_ns is None:
+        return False
+    try:
+        alive_counter(message, signal.name)
+    except DatabaseError:
+        return False
+    return True
+
+
+def _propose_publish(database: Database, signals: Signals) -> list[str]:
+    """Lines of what could carry the estimate, its validity and the bridge's mode."""
+    bench = signals.height.message.sender
+    listened = {choice.message.name for choice in signals.choices}
+    messages = [item for item in database.messages.values() if item.name not in listened]
+    # A DBC that names no nodes does not determine who sends what.
+    free = [item for item in messages if item.sender != bench] or messages
+    estimates = [item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.is_likely]
+    if not estimates:
+        return _lines_of_own_message(database)
+    best = estimates[0]
+    lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
+    # Validity and mode may have another message, but never one that another node sends.
+    sender = best.message.sender
+    near = [best.message, *(it for it in free if it is not best.message and it.sender == sender)]
+    valid = _find_integer(near, _VALID_WORDS, lambda bits: bits >= 1)
+    lines += (
+        [f"  {VALID.key}: {{message: {valid[0].name}, signal: {valid[1].name}}}"]
+        if valid
+        else [
+            "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
+            "  # unsafe: {publish_without_valid: true} accepts that",
+        ]
+    )
+    if best.message.protection is None:
         counter = _find_integer([best.message], _COUNTER_WORDS, lambda bits: bits > 1)
         if counter:
             entry = f"{{message: {counter[0].name}, signal: {counter[1].name}}}"
