@@ -85,6 +85,15 @@ class Plant(Protocol[StateT, LoadedT]):
         """State after `dt_s`, with an applied force that is linear in between."""
         ...
 
+    def slopes(
+        self, state: StateT, applied_force_n: float, temperature_c: float
+    ) -> Sequence[tuple[float, float]] | None:
+        """Stiffness (N/m) and damping (N·s/m) of each strut's law about a state.
+
+        None where they are the same in every state, or not known.
+        """
+        ...
+
     def numbers(self, state: StateT) -> Sequence[float]:
         """A state as numbers, for differences of a step."""
         ...

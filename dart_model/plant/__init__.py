@@ -74,6 +74,9 @@ class DartPlant:
         else:
             many = ManyCoordinates(self._skeleton)
             self._equations = EquationsOfMotion[Array](many, self._struts, self._geometry)
+        self._slopes_vary = self._geometry.constant is not None and not all(
+            strut.is_linear for strut in self._struts
+        )
         self.step_s = self._longest_step_s()
         """Longest step of the integrator."""
 
@@ -197,6 +200,21 @@ class DartPlant:
             applied_force_end_n: Applied force at the end; it is linear in between.
         """
         return self._equations.step(loaded, dt_s, applied_force_end_n, self.step_s)
+
+    def slopes(
+        self, state: PlantState, applied_force_n: float, temperature_c: float
+    ) -> Sequence[tuple[float, float]] | None:
+        """Stiffness (N/m) and damping (N·s/m) of each strut's law about a state.
+
+        None where they are the same in every state, where the joints change how a strut acts, or
+        where a law has no value next to the state.
+        """
+        if not self._slopes_vary:
+            return None
+        try:
+            return self._equations.slopes(state, applied_force_n, temperature_c)
+        except (ArithmeticError, ValueError):
+            return None
 
     def jacobians(self, q: Array) -> Jacobians:
         """Heights and Jacobians of the struts at coordinates `q`, shape (n,)."""

@@ -89,6 +89,16 @@ class EquationsOfMotion(Generic[Value]):
             rates,
         )
 
+    def slopes(
+        self, state: PlantState, applied_force_n: float, temperature_c: float
+    ) -> Sequence[tuple[float, float]]:
+        """Slopes of each strut's law; arguments and result as of `DartPlant.slopes`."""
+        rest = state.internal, state.t_s, applied_force_n, temperature_c
+        return [
+            strut.slopes(*motion, *rest)
+            for strut, motion in zip(self._struts, state.struts, strict=True)
+        ]
+
     def step(
         self, loaded: Loaded, dt_s: float, applied_force_end_n: float, longest_s: float
     ) -> PlantState:

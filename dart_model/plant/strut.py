@@ -20,6 +20,10 @@ from dart_model.spec import ModelSpec, StrutSpec
 _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 """How far from the free length, and how fast, effects are sampled for their steepest slope."""
 
+_SECANT_M, _SECANT_M_PER_S = 1e-3, 0.05
+"""Half of the secants by which slopes are taken: more than noise moves a model, less than the width
+of a knee."""
+
 _LARGEST_N = 1e6
 """Force beyond which heights are not sampled: an exponential spring gives any force half a metre
 from its free length, and no bench reaches a meganewton."""
@@ -112,6 +116,34 @@ class Strut:
                 )  # fmt: skip
                 internal_rates[first:end] = rates
         return force
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it has no effects, so that its slopes are the same everywhere."""
+        return not self._parts
+
+    def slopes(
+        self,
+        height_m: float,
+        velocity_m_per_s: float,
+        internal: Sequence[float],
+        t_s: float,
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> tuple[float, float]:
+        """Stiffness (N/m) and damping (N·s/m) about a motion; arguments as of `force_n`.
+
+        They are secants, which smooth what is steeper than a control loop can use: the sign of dry
+        friction, the edge of a stop.
+        """
+        others = internal, t_s, applied_force_n, temperature_c, list(internal)
+        low_m, high_m = height_m - _SECANT_M, height_m + _SECANT_M
+        slow, fast = velocity_m_per_s - _SECANT_M_PER_S, velocity_m_per_s + _SECANT_M_PER_S
+        by_height = self.force_n(low_m, velocity_m_per_s, *others) - self.force_n(
+            high_m, velocity_m_per_s, *others
+        )
+        by_velocity = self.force_n(height_m, slow, *others) - self.force_n(height_m, fast, *others)
+        return by_height / (2.0 * _SECANT_M), by_velocity / (2.0 * _SECANT_M_PER_S)
 
     def steepest(self) -> tuple[float, float]:
         """Largest stiffness (N/m) and damping (N·s/m) with effects, where a bench can get to.

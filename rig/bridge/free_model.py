@@ -325,15 +325,19 @@ class FreeModelEstimator:
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
         oldest_ns = t_ns
+        known = self._with_slopes(state.observers, model, applied_n, temperature_c)
         for strut, observer in enumerate(self.observers):
-            measured, before, band = received[strut], state.observers[strut], state.bands[strut]
+            measured, before, band = received[strut], known[strut], state.bands[strut]
             innovation = None
             if measured is not None:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
                     return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
-                model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
-                height_m = measured.value
+                height_m, model_m = measured.value, model.struts[strut][0]
+                if measured_ns != t_ns:
+                    before_tick = Instant(before_ns, loaded.state.struts, ())
+                    ticks = instants or (Instant(t_ns, model.struts, ()), before_tick)
+                    model_m = model_height_m(measured_ns, strut, ticks)
                 innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
                 sensing, was_left = self._sensing[strut], band.is_left
@@ -365,6 +369,22 @@ class FreeModelEstimator:
             tuple(bands),
         )
         return self._estimate(after, loaded, oldest_ns)
+
+    def _with_slopes(
+        self,
+        states: Sequence[ObserverState],
+        model: ModelState,
+        applied_n: float,
+        temperature_c: float,
+    ) -> Sequence[ObserverState]:
+        """States of the observers, which know the slopes of the model's laws where it is now."""
+        slopes = self._plant.slopes(model, applied_n, temperature_c)
+        if slopes is None:
+            return states
+        return [
+            observer.with_slopes(state, *of_strut)
+            for observer, state, of_strut in zip(self.observers, states, slopes, strict=True)
+        ]
 
     def _begin_again(
         self, state: FreeModelState, step_input: StepInput, strut: int, band: InnovationBand

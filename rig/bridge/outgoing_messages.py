@@ -101,9 +101,12 @@ def _page(message: Message, published: Sequence[PublishedSignal]) -> _Payload:
 
 
 def _value(message: Message, item: PublishedSignal) -> Callable[[Report, int], float]:
-    """A published value; a count stops at the end of its range, which is no saturation."""
-    value = item.publication.value
-    if not item.publication.stops_at_range:
+    """A published value; a count stops at the end of its range, or begins again behind it."""
+    value, publication = item.publication.value, item.publication
+    if not (publication.stops_at_range or publication.wraps_at_range):
         return value
-    _, high = si_range(message, item.signal, item.publication.dimension)
+    low, high = si_range(message, item.signal, publication.dimension)
+    if publication.wraps_at_range:
+        first, count = round(low), round(high) - round(low) + 1
+        return lambda report, strut: first + value(report, strut) % count
     return lambda report, strut: min(value(report, strut), high)

@@ -26,6 +26,7 @@ class Publication:
         signal: Name of its signal where the configuration names a message alone.
         meaning: What a receiver reads in it, for the guide.
         stops_at_range: A value beyond the signal's range is sent as the end of it, and no fault.
+        wraps_at_range: A value beyond it begins again at its lower end.
         attribute: Attribute of `StrutOutput` that is published as it is; empty for all else.
     """
 
@@ -35,6 +36,7 @@ class Publication:
     signal: str
     meaning: str
     stops_at_range: bool = False
+    wraps_at_range: bool = False
     attribute: str = ""
 
 
@@ -118,7 +120,16 @@ UNCERTAINTY = (
         stops_at_range=True,
     ),
 )
-STRUT = (*ESTIMATE, *KINEMATICS, *UNCERTAINTY)
+COUNTER = Publication(
+    "counter",
+    Dimension.NUMBER,
+    lambda report, _: report.number,
+    "COUNTER",
+    "frames of this message that were sent before, from the lower to the upper end of the signal's "
+    "range and again; for a message without E2E protection, which has its own counter",
+    wraps_at_range=True,
+)
+STRUT = (*ESTIMATE, *KINEMATICS, *UNCERTAINTY, COUNTER)
 """What is published of a strut."""
 
 

@@ -84,7 +84,12 @@ def diagnose(
     is_driven = result.diagnosis.held_out.strut_force_rmse_n is None
     if is_driven and (result.diagnosis.effects or result.diagnosis.linear):
         print_text(
-            f"Next: `rig run CONFIG --model {out}/corrected.yaml --listen-only --duration-s 20 "
-            f"--out second`, then `rig tune CONFIG --model {out}/corrected.yaml --run second "
-            "--out tuned-corrected.yaml`: the old gains suit the old model"
+            f"Next: `rig tune CONFIG --model {out}/corrected.yaml --run {_run_of(runs)} --out "
+            "tuned-corrected.yaml`, as the old gains suit the old model; then `rig run "
+            "tuned-corrected.yaml`"
         )
+
+
+def _run_of(paths: list[Path]) -> str:
+    """The first of the recordings that is a run, whose frames a tuning can follow again."""
+    return next((str(path) for path in paths if path.is_dir()), "RUN")

@@ -21,6 +21,10 @@ _LONGEST_READ_S = 120.0
 """Longest run that is read again at its end, which takes about 4 % of its duration."""
 
 
+_LITTLE_VALID = 0.5
+"""Share of valid ticks below which a run is remarked on."""
+
+
 def _is_long(ended: "Ended") -> bool:
     """Whether a run is too long to be read again at its end."""
     return ended.ticks * ended.period_ns > _LONGEST_READ_S * 1e9
@@ -58,6 +62,7 @@ def print_end(
     _refuse_bad_end(plan, ended, folder)
     if plan.has_force and (gaps := _gaps_of(ended, folder)) is not None:
         print_text(gaps.report(folder.name), "yellow")
+    _print_validity(ended)
     _print_stated_std(plan, ended, folder)
     if following:
         print_text(f"Next: `{following}`")
@@ -73,6 +78,20 @@ def diagnosis_of(plan: "Plan", folder: Path) -> str:
     if not plan.has_force:
         return ""
     return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
+
+
+def _print_validity(ended: "Ended") -> None:
+    """Print that an estimate was invalid for most of a run, and what to look at."""
+    from rig.bridge.values import Mode
+
+    share = ended.ticks_in_mode.get(Mode.RUNNING, 0) / max(sum(ended.ticks_in_mode.values()), 1)
+    if share < _LITTLE_VALID:
+        print_text(
+            f"The estimate was valid in only {share:.0%} of the ticks; events.jsonl has the "
+            "causes. If it is unsettled again and again, the loop is not stable in this motion: "
+            "`rig check` and `rig tune` examine that.",
+            "yellow",
+        )
 
 
 def _print_stated_std(plan: "Plan", ended: "Ended", folder: Path) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
     "`rig tune rig.yaml --residual-n 80 --up-to-hz 5 --observer pi` · after a correction: "
-    "`rig tune rig.yaml --model found/corrected.yaml --run second --out tuned-corrected.yaml`"
+    "`rig tune rig.yaml --model found/corrected.yaml --run runs/7 --out tuned-corrected.yaml`"
 )
 
 
@@ -195,6 +195,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
             "paper": strut.published.force_n,
         },
         "damping_ratio": chosen.expected.damping_ratio,
+        "damping_ratio_in_motion": chosen.in_motion,
         "gain_margin": chosen.gain_margin,
         "settling_s": chosen.expected.settling_s,
         "poles": [pole._asdict() for pole in chosen.expected.poles],
@@ -202,6 +203,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
 
 
 def _print(strut: "TunedStrut", damping_ratio: float) -> None:
+    from rig.tuning.gains import LEAST_IN_MOTION
     from rig.tuning.tune import settings_of
 
     chosen, expectation = strut.tuned, strut.expectation
@@ -231,6 +233,12 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
         console.print(
             f"No gains keep a damping ratio of {damping_ratio:g}; the best "
             f"keep {chosen.expected.damping_ratio:.3f}.",
+            style="yellow",
+        )
+    if chosen.in_motion < LEAST_IN_MOTION:
+        console.print(
+            "No gains keep the loop stable at every height and speed of this run: expect the "
+            "estimate to become invalid there. A higher rate of the height sensor helps.",
             style="yellow",
         )
     if chosen.gain_margin < 0.97 * chosen.required_margin:
@@ -278,9 +286,11 @@ def _print_errors(strut: "TunedStrut") -> None:
         for label, name in (("by noise", "noise_n"), ("by lag", "lag_n"), ("RMS", "force_n"))
     ]
     margin = strut.tuned.gain_margin
+    in_motion = strut.tuned.in_motion, *strut.others_in_motion
     rows += [
         ("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", "", f"{PAPER_HZ:.3g} Hz"),
         ("least damping ratio", *(f"{error.damping_ratio:.3f}" for error in errors)),
+        ("least damping ratio in motion", *(_damping_text(it) for it in in_motion)),
         ("settling time", *(_time_text(error.settling_s) for error in errors)),
         ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "", ""),
     ]
@@ -336,6 +346,10 @@ def _recall_limit(plan: "Plan", struts: "list[TunedStrut]", file: Path) -> None:
         f"at its end how large it was; a limit in {file} holds an estimate that is less certain: "
         "supervision: {limits: [{value: force_std_n, high: N, action: hold}]}"
     )
+
+
+def _damping_text(ratio: float) -> str:
+    return f"{ratio:.3f}" if ratio > 0.0 else "unstable"
 
 
 def _time_text(time_s: float) -> str:

@@ -93,7 +93,7 @@ def zero_command(
     readings = _read(as_read(plan), channel.name, listen_s, run)
     before = entry_of(plan, channel)
     if length_m is None:
-        found = find_tare(readings, force_n or 0.0, before)
+        found = find_tare(readings, force_n or 0.0, before, channel.step)
     else:
         found = find_zero(readings, length_m, before, is_remounted=is_remounted)
     write_mounting(plan, channel, found)

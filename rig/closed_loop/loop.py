@@ -143,6 +143,7 @@ class Loop:
         noise_m: float = 0.0,
         residual_n: float = 0.0,
         bench_m: Sequence[float] | None = None,
+        slopes: Sequence[tuple[float, float]] | None = None,
     ) -> tuple[Array, float]:
         """Numbers after the next measurement, and the error of a strut's published force.
 
@@ -153,6 +154,8 @@ class Loop:
             residual_n: Force that the bench's strut has and the model's lacks, over the interval;
                 the bench's motion is taken as given, and the model gets the force's opposite.
             bench_m: Heights of the bench when the measurement was true; at rest if absent.
+            slopes: Stiffness (N/m) and damping (N·s/m) of each strut's law that the observers know
+                of; those at the start if absent.
         """
         measured_m = self._heights_m if bench_m is None else bench_m
         parts = [x[first:end].tolist() for first, end in itertools.pairwise(self._ends)]
@@ -163,6 +166,11 @@ class Loop:
                 self._observers, self._states, parts[1:-1], strict=True
             )
         ]
+        if slopes is not None:
+            states = [
+                observer.with_slopes(state, *of_strut)
+                for observer, state, of_strut in zip(self._observers, states, slopes, strict=True)
+            ]
         timing, seen = self._timing, parts[-1]
         count = len(self._observers)
         for tick in range(1, timing.measured_every + 1):
@@ -198,24 +206,25 @@ class Loop:
         ]
         return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
 
-    def linear(self, strut: int = 0) -> LinearLoop:
-        """The loop about a slow motion, as one strut's noise and residual force drive it."""
+    def linear(self, strut: int = 0, speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> LinearLoop:
+        """The loop about a motion at a speed, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
         step_n = _ACCELERATION_STEP_M_PER_S2 / self._responses[strut].mobility_per_kg
 
-        def slopes_at(speed_m_per_s: float) -> Array:
-            moving, bench_m = self._moving(speed_m_per_s)
+        def slopes_at(velocity_m_per_s: float) -> Array:
+            moving, bench_m = self._moving(velocity_m_per_s)
+            model = self._plant.state_of(moving[: self._ends[1]].tolist())
+            slopes = self._plant.slopes(model, 0.0, AMBIENT_C)
 
             def after(u: Array) -> Array:
                 noise_m, residual_n = u[size:].tolist()
-                return np.append(
-                    *self.after(moving + u[:size], strut, noise_m, residual_n, bench_m)
-                )
+                x = moving + u[:size]
+                return np.append(*self.after(x, strut, noise_m, residual_n, bench_m, slopes))
 
             return central_differences(after, [*widths, _STEP, step_n])
 
-        slopes = 0.5 * (slopes_at(USUAL_SPEED_M_PER_S) + slopes_at(-USUAL_SPEED_M_PER_S))
+        slopes = 0.5 * (slopes_at(speed_m_per_s) + slopes_at(-speed_m_per_s))
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.loop import Loop, SampleTiming
+from rig.closed_loop.strut_response import StrutResponse
 from rig.observers.protocol import AnyObserver
 
 
@@ -27,6 +28,46 @@ class Pole(NamedTuple):
     magnitude: float
     frequency_hz: float
     damping_ratio: float
+
+
+class OperatingPoint(NamedTuple):
+    """A motion about which a loop is made linear.
+
+    Attributes:
+        heights_m: Height of each strut.
+        speed_m_per_s: Speed of each strut, in both directions.
+    """
+
+    heights_m: Sequence[float]
+    speed_m_per_s: float
+
+
+def least_damping(
+    plant: AnyPlant,
+    observers: Sequence[AnyObserver],
+    timing: SampleTiming,
+    responses: Sequence[StrutResponse],
+    points: Sequence[OperatingPoint],
+) -> tuple[float, OperatingPoint | None]:
+    """The least damping ratio of a loop at several points, and that point; 1 without a point.
+
+    The observers take the model to have the same responses everywhere; its stops and the knees of
+    its damper are in the model alone. A ratio below zero is an error that grows.
+    """
+    least: tuple[float, OperatingPoint | None] = 1.0, None
+    for point in points:
+        loop = Loop(plant, observers, point.heights_m, timing, responses)
+        poles = poles_of(loop.linear(0, point.speed_m_per_s).a, timing.interval_ns * 1e-9)
+        ratio = least_damping_ratio(poles)
+        if ratio < least[0]:
+            least = ratio, point
+    return least
+
+
+def least_damping_ratio(poles: Sequence[Pole]) -> float:
+    """Least damping ratio; an integrator that is switched off, a pole at 1, counts as 1."""
+    of_motion = [pole for pole in poles if abs(pole.magnitude - 1.0) > 1e-9]
+    return min((pole.damping_ratio for pole in of_motion), default=1.0)
 
 
 def closed_loop_poles(

@@ -14,7 +14,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal, alive_counter
 from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
-from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
+from rig.bridge.published_quantities import COUNTER, FORCE, STATUS_MESSAGE, VALID
 from rig.bus.bus import WITHOUT_BIT_RATE, BusConfig
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
@@ -43,7 +43,7 @@ _UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
 _LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
 """Rates of the bridge: that of the height where it lies between, else the usual one."""
 
-_VALID_WORDS = ("valid", "gueltig", "qual", "ok", "healthy")
+_VALID_WORDS = ("valid", "vld", "gueltig", "qual", "ok", "healthy")
 _OK_CHOICES = ("ok", "valid", "good", "gueltig", "healthy")
 _WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
@@ -401,9 +401,9 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
 
 
 def _is_described_as_valid(signal: Signal) -> bool:
-    """Whether a comment says that 1 is the value of a sensor that works."""
+    """Whether a comment says that 1 is the value of something that works."""
     return (
-        re.match(rf"1\s*[:=]?\s*(?:sensor\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
+        re.match(rf"1\s*[:=]?\s*(?:\w+\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
         is not None
     )
 
@@ -450,6 +450,11 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
             "  # unsafe: {publish_without_valid: true} accepts that",
         ]
     )
+    if best.message.protection is None:
+        counter = _find_integer([best.message], _COUNTER_WORDS, lambda bits: bits > 1)
+        if counter:
+            entry = f"{{message: {counter[0].name}, signal: {counter[1].name}}}"
+            lines.append(f"  {COUNTER.key}: {entry}")
     state = _find_integer(near, _STATE_WORDS, lambda bits: bits >= _LEAST_STATE_BITS)
     if any(item.name == STATUS_MESSAGE for item in free):
         lines.append(f"status: {STATUS_MESSAGE}")

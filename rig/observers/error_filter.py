@@ -6,11 +6,13 @@ the error of the model's height, x = z - z_model, obeys
     m d²x/dt² = d - F_v - k x - c dx/dt,
 
 m the effective mass that the strut's force moves, k and c the slopes of the model's own law, which
-is not where the bench is. The residual force is an integrated random walk of third order (the
-third derivative of d is white noise): a smooth force that nothing else is known of. State: x, its
-rate, and the acceleration d / m with its first two derivatives. The virtual force is a known input,
-so that the filter also estimates the error at the present time, when the newest measurement is some
-milliseconds old.
+is not where the bench is. The mean is predicted with the slopes at the model's present height and
+velocity: in a stop, or beyond the knee of a damper, those at rest would make errors grow. The gain
+is that of the slopes at the start. The residual force is an integrated random walk of third order
+(the third derivative of d is white noise): a smooth force that nothing else is known of. State: x,
+its rate, and the acceleration d / m with its first two derivatives. The virtual force is a known
+input, so that the filter also estimates the error at the present time, when the newest measurement
+is some milliseconds old.
 
 The intensity of the noise is given as a bandwidth: of a sensor with standard deviation sigma every
 h seconds, the steady filter is a Butterworth filter with the corner (q / (sigma² h))^(1/10).
@@ -91,6 +93,9 @@ _STEP_OF_MODEL = 0.5
 """Of a step of the mean, in radians or time constants of the model's own law: a ten-thousandth of
 its change is left out."""
 
+_MOST_OF_MODEL = 50.0
+"""The same of a whole step: of a stop that stiff, all that counts is that the error is gone."""
+
 _FADING_S = 1.0
 """Time constant with which the innovations' variance is followed."""
 
@@ -137,8 +142,6 @@ class Constants(Struct, frozen=True, gc=False):
         next_ns: Time since the last measurement from which on one is missing.
         longest_ns: How long after the last measurement the error is predicted.
         forgotten_ns: Time after which the last measurement says nothing more.
-        own_per_s: How fast the model's own law moves it: the larger one of its damping and the
-            root of its stiffness, over the mass.
         lag: Filter of the innovations that shows a lag.
     """
 
@@ -151,7 +154,6 @@ class Constants(Struct, frozen=True, gc=False):
     next_ns: int
     longest_ns: int
     forgotten_ns: int
-    own_per_s: float
     lag: LagFilter
 
 
@@ -165,6 +167,7 @@ class ErrorState(Struct, frozen=True, gc=False):
         scale: Variance of the sensor over the configured one, as the innovations show it.
         inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
             before.
+        slopes: Stiffness and damping of the model's law where it is now, over the effective mass.
         lag: Lag behind a force that changes faster than the filter allows for.
     """
 
@@ -175,6 +178,7 @@ class ErrorState(Struct, frozen=True, gc=False):
     inputs: tuple[tuple[int, float], ...]
     start: Start
     constants: Constants
+    slopes: tuple[float, float]
     lag: Lag = NO_LAG
 
 
@@ -260,7 +264,9 @@ class ErrorFilter:
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
         inputs, constants = ((start.t_ns, 0.0),), self._constants(start)
-        return ErrorState(start.t_ns, _NO_ERROR, self._prior(), 1.0, inputs, start, constants)
+        slopes = start.stiffness_per_s2, start.damping_per_s
+        prior = self._prior()
+        return ErrorState(start.t_ns, _NO_ERROR, prior, 1.0, inputs, start, constants, slopes)
 
     def steady_state(self, start: Start) -> ErrorState:
         """State after a long time without an error."""
@@ -302,7 +308,8 @@ class ErrorFilter:
                 covariance = None
         inputs = inputs_since(state.inputs, t_ns)
         mean = correct(mean, gain, new_m)
-        return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants, lag)
+        start, slopes = state.start, state.slopes
+        return ErrorState(t_ns, mean, covariance, scale, inputs, start, constants, slopes, lag)
 
     def restart(self, state: ErrorState, innovation: Innovation) -> ErrorState:
         """State at a measurement before which everything known has become worthless."""
@@ -325,7 +332,8 @@ class ErrorFilter:
     def residual(self, state: ErrorState, mean: Mean) -> float:
         """Acceleration by the force that the model lacks now, in m/s², at the predicted mean."""
         x, v, a, *_ = mean
-        return a - state.start.stiffness_per_s2 * x - state.start.damping_per_s * v
+        stiffness, damping = state.slopes
+        return a - stiffness * x - damping * v
 
     def residual_std(self, state: ErrorState, t_ns: int) -> float:
         """Standard deviation of `residual`, at a time, in m/s²."""
@@ -362,6 +370,7 @@ class ErrorFilter:
             inputs,
             state.start,
             state.constants,
+            state.slopes,
             state.lag,
         )
 
@@ -395,7 +404,6 @@ class ErrorFilter:
             (3 * interval_ns + 1) // 2,
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
             self.forgotten_ns,
-            max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
             make_lag_filter(omega, interval_ns * 1e-9, gain[:2], steady.innovation * variance_m2),
         )
 
@@ -458,7 +466,10 @@ def inputs_since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tupl
 def mean_at(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
     mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
-    start, own_per_s, last = state.start, state.constants.own_per_s, len(inputs) - 1
+    slopes, last = state.slopes, len(inputs) - 1
+    stiffness, damping = slopes
+    # How fast the model's own law moves it.
+    own_per_s = max(abs(damping), math.sqrt(abs(stiffness)))
     if to_ns <= from_ns:
         return mean
     for index, (_, by_force) in enumerate(inputs):
@@ -468,20 +479,20 @@ def mean_at(state: ErrorState, to_ns: int) -> Mean:
         h = (end_ns - from_ns) * 1e-9
         from_ns = end_ns
         # A step in which the model itself hardly moves: what its law does is a Taylor series.
-        quick = h * own_per_s
+        quick = min(h * own_per_s, _MOST_OF_MODEL)
         if quick <= _STEP_OF_MODEL:
-            mean = _taylor_step(mean, by_force, h, start)
+            mean = _taylor_step(mean, by_force, h, slopes)
             continue
         count = math.ceil(quick / _STEP_OF_MODEL)
         for _ in range(count):
-            mean = _taylor_step(mean, by_force, h / count, start)
+            mean = _taylor_step(mean, by_force, h / count, slopes)
     return mean
 
 
-def _taylor_step(mean: Mean, by_force: float, h: float, start: Start) -> Mean:
+def _taylor_step(mean: Mean, by_force: float, h: float, slopes: tuple[float, float]) -> Mean:
     """The mean after a step, to the fifth order of the error's Taylor series."""
     x, v, a, j, s = mean
-    stiffness, damping = start.stiffness_per_s2, start.damping_per_s
+    stiffness, damping = slopes
     x2 = a + by_force - stiffness * x - damping * v
     x3 = j - stiffness * v - damping * x2
     x4 = s - stiffness * x2 - damping * x3

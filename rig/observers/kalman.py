@@ -157,6 +157,13 @@ class KalmanObserver:
             error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion, is_disturbed
         )
 
+    def with_slopes(
+        self, state: KalmanState, stiffness_n_per_m: float, damping_n_s_per_m: float
+    ) -> KalmanState:
+        per_kg = state.error.start.mobility_per_kg
+        slopes = stiffness_n_per_m * per_kg, damping_n_s_per_m * per_kg
+        return structs.replace(state, error=structs.replace(state.error, slopes=slopes))
+
     def longest_gap_ns(self, interval_ns: int) -> int:
         """The time after which the filter knows nothing more: until then its variances say what."""
         del interval_ns

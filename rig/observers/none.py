@@ -67,6 +67,12 @@ class NoObserver:
         del state, innovation, further
         return NoState(t_ns)
 
+    def with_slopes(
+        self, state: NoState, stiffness_n_per_m: float, damping_n_s_per_m: float
+    ) -> NoState:
+        del stiffness_n_per_m, damping_n_s_per_m
+        return state
+
     def longest_gap_ns(self, interval_ns: int) -> int:
         del interval_ns
         return sys.maxsize

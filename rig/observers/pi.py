@@ -174,6 +174,12 @@ class PiObserver:
             is_disturbed,
         )
 
+    def with_slopes(
+        self, state: PiState, stiffness_n_per_m: float, damping_n_s_per_m: float
+    ) -> PiState:
+        del stiffness_n_per_m, damping_n_s_per_m
+        return state
+
     def longest_gap_ns(self, interval_ns: int) -> int:
         return _LONGEST_GAP * interval_ns
 

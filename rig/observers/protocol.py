@@ -160,6 +160,12 @@ class Observer(Protocol[StateT]):
         """
         ...
 
+    def with_slopes(
+        self, state: StateT, stiffness_n_per_m: float, damping_n_s_per_m: float
+    ) -> StateT:
+        """State that knows the slopes of the model's law where the model is now."""
+        ...
+
     def longest_gap_ns(self, interval_ns: int) -> int:
         """Longest time without a measurement that a state is worth keeping for.
 

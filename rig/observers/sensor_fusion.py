@@ -225,6 +225,7 @@ def _update(
         inputs_since(state.inputs, innovation.t_ns),
         state.start,
         constants,
+        state.slopes,
     ), is_within
 
 

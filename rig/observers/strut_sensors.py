@@ -63,12 +63,12 @@ STRUT_SENSORS: Mapping[Quantity, StrutSensor] = MappingProxyType(
 def model_reading(t_ns: int, channel: Channel, instants: Sequence[Instant]) -> float:
     """What a sensor of the model would have read at a time.
 
-    A height is first order from the tick after that time, anything else linear between two ticks.
-    `instants` has the newest tick first.
+    A height is that of `model_height_m`, anything else linear between two ticks. `instants` has the
+    newest tick first.
     """
     now, strut = instants[0], channel.strut
     if channel.quantity is HEIGHT:
-        return model_height_m(t_ns, strut, now.t_ns, now.struts, instants)
+        return model_height_m(t_ns, strut, instants)
     before = after = now
     for before in instants[1:]:
         if before.t_ns <= t_ns:
@@ -82,21 +82,28 @@ def model_reading(t_ns: int, channel: Channel, instants: Sequence[Instant]) -> f
     return earlier + share * (later - earlier)
 
 
-def model_height_m(
-    measured_ns: int,
-    strut: int,
-    t_ns: int,
-    struts: Sequence[tuple[float, float]],
-    instants: Sequence[Instant],
-) -> float:
-    """Height of the model at the time of a measurement, to first order from the tick after it.
+def model_height_m(measured_ns: int, strut: int, instants: Sequence[Instant]) -> float:
+    """Height of the model at the time of a measurement.
 
-    The newest tick is at `t_ns`, with height (m) and velocity (m/s) of each strut; `instants` are
-    the ticks, the newest first, empty where no measurement is late.
+    Between two ticks it is the cubic through heights and velocities at both: with a force that is
+    constant from tick to tick, the model's height is a parabola. (To first order, the virtual force
+    of the tick before would seem to be an error of the model, and make fast loops unstable.) Before
+    the oldest tick it is first order. `instants` has the newest tick first.
     """
-    for earlier in instants:
-        if earlier.t_ns < measured_ns:
-            break
-        t_ns, struts = earlier.t_ns, earlier.struts
-    height_m, velocity_m_per_s = struts[strut]
-    return height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
+    after = instants[0]
+    for before in instants[1:]:
+        if before.t_ns <= measured_ns:
+            return _between(measured_ns, strut, before, after)
+        after = before
+    height_m, velocity_m_per_s = after.struts[strut]
+    return height_m - velocity_m_per_s * (after.t_ns - measured_ns) * 1e-9
+
+
+def _between(t_ns: int, strut: int, before: Instant, after: Instant) -> float:
+    """The cubic through the heights and velocities at two ticks (Hermite)."""
+    (low_m, low_rate), (high_m, high_rate) = before.struts[strut], after.struts[strut]
+    step_ns = after.t_ns - before.t_ns
+    share = (t_ns - before.t_ns) / step_ns
+    rest = 1.0 - share
+    line_m = rest * rest * (1.0 + 2.0 * share) * low_m + share * share * (1.0 + 2.0 * rest) * high_m
+    return line_m + share * rest * step_ns * 1e-9 * (rest * low_rate - share * high_rate)

@@ -18,9 +18,10 @@ from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_interface
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
-from rig.closed_loop.poles import Pole, closed_loop_poles
-from rig.closed_loop.strut_response import find_driving_speeds_m_per_s
+from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
+from rig.closed_loop.strut_response import find_driving_speeds_m_per_s, strut_responses
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, vital_channels
@@ -28,6 +29,9 @@ from rig.plan.plan import Plan, vital_channels
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
 to one third."""
+
+_FAST_M_PER_S = 0.5
+"""Speed beyond the knee of nearly every damper, at which a loop is checked, too."""
 
 _IN_STEP = "virtual"
 """Interface within one process: a simulated bench on it is in step with the bridge."""
@@ -501,6 +505,7 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst < 1.0:
         findings.append(Finding(Severity.OK, "poles, one cycle late", text))
+        findings.append(_in_motion(plan, plant, rest, timing))
     elif findings[0].severity is not Severity.ERROR:
         # On a bus between two machines nothing keeps the bench in step.
         is_real = plan.config.bus.interface != _IN_STEP
@@ -508,6 +513,34 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
         severity = Severity.ERROR if is_real else Severity.WARNING
         findings.append(Finding(severity, "poles, one cycle late", text))
     return findings
+
+
+def _in_motion(plan: Plan, plant: AnyPlant, rest: Sequence[float], timing: SampleTiming) -> Finding:
+    """Whether errors decay in a fast motion and at the limits of the travel, too.
+
+    There the model may be in a stop, or its damper beyond a knee.
+    """
+    limits = plan.config.supervision.limits
+    ends = [
+        end
+        for limit in limits
+        if limit.value in (LimitedValue.MEASURED_HEIGHT_M, LimitedValue.HEIGHT_M)
+        and (limit.strut or plan.strut_names[0]) == plan.strut_names[0]
+        for end in (limit.low, limit.high)
+        if end is not None and end > 0.0
+    ]
+    heights = [rest, *((end, *rest[1:]) for end in ends)]
+    points = [OperatingPoint(at, _FAST_M_PER_S) for at in heights]
+    responses = strut_responses(plant, rest)
+    ratio, point = least_damping(plant, plan.observers, timing, responses, points)
+    text = f"least damping ratio {ratio:.3f} at {_FAST_M_PER_S:g} m/s"
+    if point is not None and ratio < 0.0:
+        text = (
+            f"at {_FAST_M_PER_S:g} m/s and {point.heights_m[0]:.4g} m, errors grow (damping ratio "
+            f"{ratio:.3f}): choose other gains by `rig tune --run` with a run of the usual motion"
+        )
+        return Finding(Severity.WARNING, "poles in motion", text)
+    return Finding(Severity.OK, "poles in motion", text)
 
 
 def _settling(plan: Plan) -> list[Finding]:

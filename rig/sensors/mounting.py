@@ -24,6 +24,10 @@ _FEWEST = 10
 _MOST_MOTION_M = 1e-3
 """Span of nine tenths of the readings beyond which the strut is not at rest."""
 
+_MOST_STD, _MOST_DRIFT = 5.0, 20.0
+"""Standard deviation and drift of a force over its noise, beyond which it is not constant: a motion
+is hundreds of times the noise, the creep of a cylinder some times."""
+
 _LEAST_CHANGE_M = 5e-3
 """Between two lengths from which direction and scale are determined: a length read off a steel
 rule errs by half a millimetre."""
@@ -40,6 +44,7 @@ class Readings(NamedTuple):
         std: Standard deviation about their line.
         drift: Change of that line over their time.
         span: Of the middle nine tenths.
+        noise: Standard deviation as neighbouring readings differ: a slow motion is not in it.
     """
 
     samples: int
@@ -48,6 +53,7 @@ class Readings(NamedTuple):
     std: float
     drift: float
     span: float
+    noise: float
 
 
 def find_channel(plan: Plan, name: str) -> Channel:
@@ -165,8 +171,9 @@ def summarise(t_s: Array, values: Array) -> Readings:
     residual = values - (mean + slope * centred_s)
     low, high = np.quantile(values, (0.05, 0.95))
     duration_s = float(t_s[-1] - t_s[0])
-    std = float(residual.std())
-    return Readings(len(values), duration_s, mean, std, slope * duration_s, float(high - low))
+    std, noise = float(residual.std()), float(np.std(np.diff(values))) / 2.0**0.5
+    drift = slope * duration_s
+    return Readings(len(values), duration_s, mean, std, drift, float(high - low), noise)
 
 
 class Mounting(NamedTuple):
@@ -222,8 +229,23 @@ def _scale(reads: float, length_m: float, last: Zero) -> float | None:
     return scale
 
 
-def find_tare(readings: Readings, force_n: float, before: MeasuredSignal) -> Mounting:
-    """The tare of a force's sensor on which a known force acts, in N by the channel's sign."""
+def find_tare(
+    readings: Readings, force_n: float, before: MeasuredSignal, step_n: float
+) -> Mounting:
+    """The tare of a force's sensor on which a known force acts, in N by the channel's sign.
+
+    `step_n` is the step of its signal.
+
+    Raises:
+        InputError: The force changes by far more than neighbouring readings differ.
+    """
+    noise_n = max(readings.noise, step_n)
+    if readings.std > _MOST_STD * noise_n or abs(readings.drift) > _MOST_DRIFT * noise_n:
+        raise InputError(
+            f"the force changes while it is read (standard deviation {readings.std:.3g} N, drift "
+            f"{readings.drift:.3g} N; neighbouring readings differ by {readings.noise:.2g} N), "
+            "expected a constant one: bring the bench to rest, and measure again"
+        )
     acting_n = -force_n if before.reversed else force_n
     return Mounting({"tare_n": round(readings.mean - acting_n, 4)})
 

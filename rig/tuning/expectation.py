@@ -6,6 +6,7 @@ over that mass, smoothed as in a diagnosis, which also finds the sensor's noise.
 """
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
+from rig.closed_loop.poles import OperatingPoint
+from rig.closed_loop.strut_response import USUAL_SPEED_M_PER_S
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
-from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
 
@@ -28,6 +30,10 @@ _SHORTEST_S = 1.0
 
 FEWEST = 200
 """Measurements: a standard deviation within a tenth."""
+
+_AT_END, _FAST, _APART = 0.01, 0.95, 5
+"""Share of a run that is beyond an end of its travel, share that is slower than its fast motion,
+and samples between which a speed is taken."""
 
 _LINES = 120
 """Frequencies into which a spectrum is gathered."""
@@ -115,6 +121,32 @@ def longest_stretch(
     return FollowedStretch(t_s, free_m, tick_s, law_n, height_m, velocity, applied_n)
 
 
+def operating_points(steps: pa.Table, struts: Sequence[str]) -> list[OperatingPoint]:
+    """Motions of a run: at its mid-stroke and at both ends of its travel, slow and fast.
+
+    Ends and speed leave out the outermost hundredth, and twentieth, of the run. Empty where a
+    height was not measured.
+    """
+    heights: list[Array] = []
+    fast = USUAL_SPEED_M_PER_S
+    for strut in struts:
+        values = np.asarray(steps.column(f"{strut}.measured_height_m").to_numpy(), np.float64)
+        fresh = np.isfinite(values)
+        if np.sum(fresh) < FEWEST:
+            return []
+        t_s = np.asarray(steps.column("t_ns").to_numpy(), np.float64)[fresh] * 1e-9
+        heights.append(np.quantile(values[fresh], [_AT_END, 0.5, 1.0 - _AT_END]))
+        # Over some samples, so that the sensor's noise is no speed.
+        rate = (values[fresh][_APART:] - values[fresh][:-_APART]) / (t_s[_APART:] - t_s[:-_APART])
+        fast = max(fast, float(np.quantile(np.abs(rate), _FAST)))
+    low, middle, high = ([float(of[i]) for of in heights] for i in range(3))
+    slow = USUAL_SPEED_M_PER_S
+    return [
+        OperatingPoint(at, speed)
+        for at, speed in ((middle, fast), (low, slow), (low, fast), (high, slow), (high, fast))
+    ]
+
+
 def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) -> Array:
     """Error of the model had there been no virtual force, but for a straight line, shape (N,).
 
@@ -136,13 +168,15 @@ def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> tuple[fl
     return float(np.sqrt(noise.variance)), smoothed.states[:, 2] / mobility_per_kg
 
 
-def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
-    """Expectation of a strut from a run of its bench.
+def expectation_from_run(
+    steps: pa.Table, folder: Path, strut: str, mobility_per_kg: float
+) -> Expectation:
+    """Expectation of a strut from the steps of a run of its bench, which the folder names.
 
     Raises:
-        InputError: It is no run, has no such strut, or is too short.
+        InputError: It has no such strut, or is too short.
     """
-    stretch = longest_stretch(read_run(folder).steps, folder, strut, mobility_per_kg)
+    stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
     noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
     by_late_n = part_by_late_force(stretch, force_n)
     source = f"{folder}, {np.ptp(stretch.tick_s):.3g} s in RUNNING"

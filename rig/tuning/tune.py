@@ -1,12 +1,13 @@
 """From a configuration and a run to a configuration with tuned observers."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from _typeshed import DataclassInstance
 
 from can_dbc.codec import si_step
@@ -14,16 +15,24 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text
 from rig.channels.channel import Channel
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.poles import OperatingPoint
+from rig.closed_loop.strut_response import StrutResponse, strut_responses
 from rig.diagnosis.progress import Progress, within
 from rig.files.yaml_edit import edit_keys
+from rig.log.reader import read_run
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import paper_observer
 from rig.observers.protocol import AnyObserver, AnyTunableObserver
 from rig.plan.build import build_plant
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
-from rig.tuning.expectation import Expectation, expectation_from_noise, expectation_from_run
+from rig.run.replay import replay
+from rig.tuning.expectation import (
+    Expectation,
+    expectation_from_noise,
+    expectation_from_run,
+    operating_points,
+)
 from rig.tuning.gains import (
     Aim,
     ExpectedError,
@@ -34,6 +43,9 @@ from rig.tuning.gains import (
     tune_observer,
 )
 from rig.tuning.latency import Latency, estimate_latency, with_delay
+
+_FAST_M_PER_S = 0.5
+"""Speed at which a loop has to be stable where no run shows how fast its bench is."""
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
 """Of the bandwidths that are plotted: from a sixth to six times the choice."""
@@ -61,6 +73,7 @@ class TunedStrut:
         delay_s: Delay that it was tuned with.
         configured: Expected error of the observer as it is configured.
         published: Expected error of the published gains, scaled by the effective mass.
+        others_in_motion: Least damping ratio at the run's operating points of both of these.
         sweep: Expected errors at other bandwidths, by their frequencies in Hz.
     """
 
@@ -71,6 +84,7 @@ class TunedStrut:
     tuned: Tuned
     configured: ExpectedError
     published: ExpectedError
+    others_in_motion: tuple[float, float]
     bandwidth_hz: float
     sweep: list[tuple[float, ExpectedError]]
 
@@ -103,14 +117,37 @@ def tune(
     heights_m = [strut.free_length_m for strut in plan.struts]
     responses = strut_responses(plant, heights_m)
     progress("reading what is to be expected", 0.0)
-    expectations = [
-        _expectation(source, channel, response.mobility_per_kg)
-        for channel, response in zip(plan.heights, responses, strict=True)
-    ]
-    others = tuple(
-        KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
-        for item, strut in zip(expectations, plan.struts, strict=True)
-    )
+    steps = read_run(source).steps if isinstance(source, Path) else None
+    expectations = _expectations(plan, source, steps, responses)
+    points = [OperatingPoint(heights_m, _FAST_M_PER_S)]
+    if steps is not None:
+        points = operating_points(steps, plan.strut_names) or points
+    others = _before_tuning(plan, expectations)
+    if isinstance(source, Path) and plan_of_run(source).model != plan.model:
+        # With the run's frames, and observers that are stable with the other model.
+        progress("the run with this model", 0.0)
+        followers = {
+            strut.name: tune_observer(
+                TuningProblem(
+                    plant,
+                    others,
+                    index,
+                    responses,
+                    heights_m,
+                    SampleTiming.of(plan.period_ns, strut.interval_ns, 0),
+                    expectations[index],
+                    cast("AnyTunableObserver", strut.observer).force_limit_n,
+                    points,
+                ),
+                "kalman",
+                aim,
+            ).observer
+            for index, strut in enumerate(plan.struts)
+        }
+        own = plan_of_run(source).with_model(plan.model).with_observers(followers)
+        steps = replay(source, plan=own).steps
+        expectations = _expectations(plan, source, steps, responses)
+        others = _before_tuning(plan, expectations)
     tuned: list[TunedStrut] = []
     for index, strut in enumerate(plan.struts):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
@@ -127,6 +164,7 @@ def tune(
                 SampleTiming.of(plan.period_ns, interval_ns, round(delay_s * 1e9)),
                 expectations[index],
                 cast("AnyTunableObserver", observer).force_limit_n,
+                points,
             )
 
         latency, delay_s = _find_delay(plan, source, problem_at, aim, part)
@@ -144,6 +182,7 @@ def tune(
                 chosen,
                 expect_error(problem, strut.observer),
                 expect_error(problem, published),
+                (problem.damping_in_motion(strut.observer), problem.damping_in_motion(published)),
                 chosen.observer.bandwidth_hz(problem.mobility_per_kg),
                 sweep_bandwidth(problem, chosen.observer, _FACTORS),
             )
@@ -151,13 +190,30 @@ def tune(
     return tuned
 
 
-def _expectation(
-    source: Path | StatedExpectation, height: Channel, mobility_per_kg: float
-) -> Expectation:
-    if isinstance(source, Path):
-        return expectation_from_run(source, height.name, mobility_per_kg)
-    noise_std_m = source.noise_std_m or _quantisation_m(height)
-    return expectation_from_noise(noise_std_m, source.rms_n, source.up_to_hz)
+def _expectations(
+    plan: Plan,
+    source: Path | StatedExpectation,
+    steps: "pa.Table | None",
+    responses: Sequence[StrutResponse],
+) -> list[Expectation]:
+    """What the observers have to expect, from the steps of a run or as stated."""
+    found: list[Expectation] = []
+    for height, response in zip(plan.heights, responses, strict=True):
+        if steps is not None and isinstance(source, Path):
+            per_kg = response.mobility_per_kg
+            found.append(expectation_from_run(steps, source, height.name, per_kg))
+        elif isinstance(source, StatedExpectation):
+            noise_std_m = source.noise_std_m or _quantisation_m(height)
+            found.append(expectation_from_noise(noise_std_m, source.rms_n, source.up_to_hz))
+    return found
+
+
+def _before_tuning(plan: Plan, expectations: Sequence[Expectation]) -> tuple[KalmanObserver, ...]:
+    """Observers of the struts whose turn has not come."""
+    return tuple(
+        KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
+        for item, strut in zip(expectations, plan.struts, strict=True)
+    )
 
 
 def _find_delay(

@@ -76,6 +76,9 @@ class StandStill:
     def step(self, loaded, _dt_s, _applied_force_end_n) -> Standing:
         return loaded
 
+    def slopes(self, _state, _applied_force_n, _temperature_c) -> None:
+        return None
+
 
 def dbc(count: int) -> str:
     """A height and an estimate of each strut, protected, in frames of their own."""

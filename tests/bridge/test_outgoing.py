@@ -5,7 +5,10 @@ from itertools import pairwise
 import cantools.database
 import pytest
 
-from can_dbc.database import DEFAULT_DATABASE
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from rig.bridge.counts import Conditions, Report
+from rig.bridge.outgoing_messages import PublishedSignal, compile_outgoing
+from rig.bridge.published_quantities import COUNTER
 from rig.bridge.values import Mode, StrutOutput
 from tests.faults.trial import MS, Trial
 
@@ -39,6 +42,26 @@ def test_counters_go_up_by_one(ticks):
     for name in ("RIG_ESTIMATE", "RIG_STATUS"):
         counters = [values["COUNTER"] for _, values in sent(ticks, name)]
         assert {(b - a) % 16 for a, b in pairwise(counters)} == {1}
+
+
+def test_a_counter_without_protection_goes_round_its_range(tmp_path):
+    lines = [
+        'VERSION ""', "BS_:", "BU_: BENCH RIG",
+        "BO_ 256 ESTIMATE: 8 RIG",
+        ' SG_ FORCE : 0|16@1- (1,0) [-32768|32767] "N" BENCH',
+        ' SG_ COUNT : 16|4@1+ (1,0) [0|15] "" BENCH',
+    ]  # fmt: skip
+    (tmp_path / "own.dbc").write_text("\n".join(lines) + "\n")
+    message = load_database(tmp_path / "own.dbc").message("ESTIMATE")
+    outgoing = compile_outgoing(message, [PublishedSignal("COUNT", COUNTER)])
+    tick = Trial().run(1)[0]
+    counts = []
+    for number in range(40):
+        report = Report(tick.result.output, tick.counts, tick.counts, Conditions(), number)
+        frame, saturated = outgoing.frame(report, 0)
+        assert not saturated
+        counts.append(frame.data[2] & 0x0F)
+    assert counts == [number % 16 for number in range(40)]
 
 
 def test_what_is_sent_is_what_the_core_published(ticks):

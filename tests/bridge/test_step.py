@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import random
 from itertools import pairwise
 
 import pytest
@@ -17,6 +18,8 @@ from rig.bridge.mode_supervisor import Event, Reports, Supervisor
 from rig.bridge.supervision_limits import Action
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
 from tests.bridge.cores import (
     FIRST,
     GAINS,
@@ -208,14 +211,32 @@ def test_the_published_force_is_that_of_spring_damper_and_observer():
 
 def test_a_late_measurement_is_compared_with_the_model_of_its_own_time():
     rig = core()
-    states, _ = run(rig, [measured(tick, 0.4) for tick in range(20)])
+    states, outputs = run(rig, [measured(tick, 0.4) for tick in range(20)])
     late_ns = 600_000
     _, fresh, _ = rig.step(states[-1], measured(20, 0.41))
     _, late, _ = rig.step(states[-1], measured(20, 0.41, late_ns=late_ns))
-    # The model's velocity before the correction is the same in both.
+    # The model's velocities at both ticks, before the correction, are the same in both.
+    before = outputs[-1].struts[0].velocity_m_per_s
     free = rig.step(states[-1], measured(20, None))[1].struts[0].velocity_m_per_s
+    late_s = late_ns * 1e-9
+    fallen_m = free * late_s - 0.5 * (free - before) / (MS * 1e-9) * late_s**2
     difference = late.struts[0].innovation_m - fresh.struts[0].innovation_m
-    assert difference == pytest.approx(free * late_ns * 1e-9, rel=1e-6)
+    assert difference == pytest.approx(fallen_m, rel=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.73, 0.9])
+def test_a_fast_loop_is_stable_whenever_between_two_ticks_its_heights_are_measured(share):
+    """A virtual force that is left out of the height between two ticks acts as an error of it."""
+    filter_ = ErrorFilter.within(115.0, 1e-5)
+    rig = core(observer=KalmanObserver("kalman", filter_, 1e5))
+    noise = random.Random(5)
+    heights = [REST_M + noise.gauss(0.0, 1e-5) for _ in range(300)]
+    heights += [REST_M] * 1500
+    inputs = [measured(k, h, late_ns=round(share * MS)) for k, h in enumerate(heights)]
+    _, outputs = run(rig, inputs)
+    forces = [abs(output.struts[0].virtual_force_n) for output in outputs if output.struts]
+    assert max(forces) < 2000.0
+    assert forces[-1] < 1e-3
 
 
 def test_a_stale_measurement_freezes_the_integral_and_then_leads_to_the_safe_state():

@@ -212,12 +212,14 @@ def test_a_signal_that_says_valid_and_one_of_the_mode_are_proposed(dbc, tmp_path
         DBC.replace(
             " SG_ Setpoint",
             ' SG_ ForceOk : 40|1@0+ (1,0) [0|1] "" SENSOR\n'
-            ' SG_ BridgeState : 55|4@0+ (1,0) [0|15] "" SENSOR\n SG_ Setpoint',
+            ' SG_ BridgeState : 55|4@0+ (1,0) [0|15] "" SENSOR\n'
+            ' SG_ MsgCnt : 59|4@0+ (1,0) [0|15] "" SENSOR\n SG_ Setpoint',
         )
     )
     text = propose(dbc)
     proposed = yaml.safe_load(text)
     assert proposed["publish"]["valid"] == {"message": "CONTROL_1", "signal": "ForceOk"}
+    assert proposed["publish"]["counter"] == {"message": "CONTROL_1", "signal": "MsgCnt"}
     assert proposed["status"] == {"state": {"message": "CONTROL_1", "signal": "BridgeState"}}
     (tmp_path / "my.yaml").write_text(text)
     assert not errors(load_plan(tmp_path / "my.yaml"))

@@ -66,6 +66,9 @@ class ToyPlant:
             state = State(state.height_m + h * v, v)
         return state
 
+    def slopes(self, _state, _applied_force_n, _temperature_c):
+        return None
+
     def numbers(self, state):
         return state.height_m, state.velocity_m_per_s
 

@@ -16,7 +16,7 @@ from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.recordings.run_folder import read_channel
-from rig.sensors.mounting import Readings, describe_arrivals, find_zero, summarise
+from rig.sensors.mounting import Readings, describe_arrivals, find_tare, find_zero, summarise
 from rig.simulated_bench.config import load_bench_config
 from tests.run.test_runs import lockstep
 
@@ -174,7 +174,7 @@ def test_noise_and_drift_are_those_about_a_line():
 @pytest.mark.parametrize("change_m", [0.0, 0.004, -0.004])
 def test_lengths_that_are_near_leave_the_direction_as_it_was(change_m):
     before = MeasuredSignal(message="M", signal="S", zero=Zero(reads=0.2, at_m=0.4), reversed=True)
-    readings = Readings(100, 1.0, 0.2 + 0.5 * change_m, 0.0, 0.0, 0.0)
+    readings = Readings(100, 1.0, 0.2 + 0.5 * change_m, 0.0, 0.0, 0.0, 0.0)
     found = find_zero(readings, 0.4 + change_m, before, is_remounted=False)
     assert "reversed" not in found.keys
     assert found.scale is None
@@ -201,3 +201,19 @@ def test_frames_that_come_more_often_than_the_dbc_states_are_named(tmp_path, run
     assert f"arrives every {every_ms:g} ms, and the DBC states a cycle of {10 * every_ms:g}" in text
     assert "gaps or bursts" in describe_arrivals(run, height, valid_s)
     assert "of which 3 hold a valid" in describe_arrivals(run, height, valid_s[:3])
+
+
+def test_a_force_that_changes_is_no_tare():
+    t_s, rng = np.arange(1000) * 3e-3, np.random.default_rng(3)
+    before = MeasuredSignal(message="M", signal="F")
+    noise_n = rng.normal(0.0, 1.1, len(t_s))
+    at_rest = summarise(t_s, 2.5 + noise_n)
+    assert find_tare(at_rest, 0.0, before, 0.5).keys == {"tare_n": pytest.approx(2.5, abs=0.2)}
+    coarse = summarise(t_s, np.where(t_s > 1.5, 2.5, 2.0))
+    assert find_tare(coarse, 0.0, before, 0.5).keys["tare_n"] == pytest.approx(2.25, abs=0.01)
+    moving = summarise(t_s, 100.0 * np.sin(6.0 * t_s) + noise_n)
+    with pytest.raises(InputError, match="bring the bench to rest"):
+        find_tare(moving, 0.0, before, 0.5)
+    drifting = summarise(t_s, 30.0 * t_s + noise_n)
+    with pytest.raises(InputError, match="drift 89"):
+        find_tare(drifting, 0.0, before, 0.5)

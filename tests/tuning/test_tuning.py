@@ -9,15 +9,21 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
-from dart_model.spec import MODELS
+from dart_model.plant import DartPlant
+from dart_model.spec import MODELS, parse_model
 from rig.cli.main import main
+from rig.closed_loop.loop import SampleTiming
+from rig.closed_loop.poles import OperatingPoint, least_damping
+from rig.closed_loop.strut_response import strut_responses
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan, plan_of_run
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
-from rig.tuning.expectation import FollowedStretch, part_by_late_force
-from rig.tuning.gains import Aim
+from rig.tuning.expectation import FollowedStretch, expectation_from_noise, part_by_late_force
+from rig.tuning.gains import LEAST_IN_MOTION, Aim, TuningProblem, tune_observer
 from rig.tuning.tune import StatedExpectation, tune, write_config
 
 STEP_M = 15e-6
@@ -108,6 +114,52 @@ def test_an_applied_force_that_arrives_late_is_reported(tmp_path, capsys, monkey
     shown = " ".join(capsys.readouterr().out.split())
     assert "The applied force arrives" in shown
     assert "ms later than the height" in shown
+
+
+def test_another_model_is_tuned_with_the_frames_of_a_run(late):
+    """A run with the old model is enough: its frames are followed again with the new one."""
+    ready, before = tuned(late)
+    strut = ready.model.struts[0].model_copy(update={"damping_n_s_per_m": 63.0})
+    nearer = ready.with_model(ready.model.model_copy(update={"struts": (strut,)}))
+    [after] = tune(nearer, late / "run", "kalman", Aim(), lambda _what, _share: None)
+    own_n, other_n = (float(it.expectation.power_n2.sum()) ** 0.5 for it in (before, after))
+    assert other_n < 0.8 * own_n
+    assert after.expectation.noise_std_m == pytest.approx(before.expectation.noise_std_m, rel=0.02)
+
+
+def test_a_tuned_loop_is_stable_beyond_the_knee_of_a_damper():
+    """A slow observer that takes the damper's slope at rest for that in motion lets errors grow."""
+    content = yaml.safe_load((MODELS / "reference.yaml").read_text())
+    content["struts"][0] |= {"stiffness_n_per_m": 12_000.0, "damping_n_s_per_m": 800.0}
+    digressive = {
+        "lost_compression_n_s_per_m": 700.0,
+        "compression_knee_m_per_s": 0.15,
+        "added_rebound_n_s_per_m": 300.0,
+        "lost_rebound_n_s_per_m": 1000.0,
+        "rebound_knee_m_per_s": 0.2,
+        "sharpness": 8.0,
+    }
+    content["struts"][0]["effects"] = [{"name": "valve_damping", "parameters": digressive}]
+    plant = DartPlant(parse_model(yaml.safe_dump(content), "a test"))
+    heights, fast = [0.5], OperatingPoint([0.5], 0.6)
+    responses = strut_responses(plant, heights)
+    timing = SampleTiming(2_000_000)
+    slow = KalmanObserver("kalman", ErrorFilter.within(5.0, 1e-5), 5000.0)
+
+    def damping(observer, point):
+        return least_damping(plant, (observer,), timing, responses, [point])[0]
+
+    assert damping(slow, OperatingPoint([0.5], 0.05)) > 0.1
+    assert damping(slow, fast) < 0.0
+    expectation = expectation_from_noise(1e-5, 5.0, 4.0)
+    problem = TuningProblem(
+        plant, (slow,), 0, responses, heights, timing, expectation, 5000.0, [fast]
+    )
+    found = tune_observer(problem, "kalman", Aim())
+    assert found.in_motion == pytest.approx(damping(found.observer, fast))
+    assert found.in_motion > 0.9 * LEAST_IN_MOTION
+    unaware = tune_observer(problem._replace(points=()), "kalman", Aim())
+    assert damping(unaware.observer, fast) < 0.0
 
 
 def test_a_late_force_leaves_its_rate_in_the_residual_force():

@@ -384,9 +384,10 @@ def rank_laws(
         jobs = [(at, values) for at, best in list(general) for _, values in best]
         coarse = best_of_each([*coarse, *pool.map(this.refine_coarsely, jobs)])
         fine = [s for s in pool.map(this.refine, coarse[:_FINE]) if s is not None]
-    nothing, coarse_nothing = (
-        max(float(target @ target), 1e-300) for target in (stage.target, this.coarse.target)
-    )
+    with np.errstate(over="ignore"):  # an infinite sum of squares makes each share zero
+        nothing, coarse_nothing = (
+            max(float(target @ target), 1e-300) for target in (stage.target, this.coarse.target)
+        )
     fine = [s._replace(share=s.cost / nothing) for s in fine]
     # Coarse costs in terms of fine ones, for laws that are not refined there.
     scale = len(stage.target) / len(this.coarse.target)
