@@ -156,8 +156,8 @@ class HeldOut:
     strut_force_rmse_n: BeforeAfter | None
     runs: tuple[RunFigures, ...]
     source: Literal["runs", "blocks"]
-    linear_height_rmse_m: float = math.nan
-    linear_residual_force_rmse_n: float = math.nan
+    linear_height_rmse_m: float = np.nan
+    linear_residual_force_rmse_n: float = np.nan
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from rig.diagnosis.outcome import (
     NoiseFloor,
     RejectedEffect,
     Result,
-    RunFigures,
     Verdict,
     White,
 )
@@ -329,6 +328,7 @@ def _suggestion(search: SearchResult) -> str:
 
 def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldOut:
     figures = [run.figures for run in evaluations]
+    is_prescribed = any(np.isnan(it.height_rmse_m.before) for it in figures)
     cells = [f.strut_force_rmse_n for f in figures if f.strut_force_rmse_n is not None]
     return HeldOut(
         quadratic_means([f.height_rmse_m for f in figures]),
@@ -336,15 +336,9 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
         quadratic_means(cells) if cells else None,
         tuple(figures),
         "blocks" if by_blocks else "runs",
-        np.nan
-        if any(map(_is_prescribed, figures))
-        else quadratic_mean([it.linear for it in evaluations]),
+        np.nan if is_prescribed else quadratic_mean([it.linear for it in evaluations]),
         quadratic_mean([it.linear_force_n for it in evaluations]),
     )
-
-
-def _is_prescribed(figures: RunFigures) -> bool:
-    return bool(np.isnan(figures.height_rmse_m.before))
 
 
 def _collect_series(

@@ -117,7 +117,7 @@ def finding_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot 
         ((i, _mean_over(joined.values[there, i], before - after)) for i in (0, 1)),
         key=lambda item: -float(np.mean((before - item[1]) ** 2)),
     )
-    against = joined.values[there, column]
+    against: Array = joined.values[there, column]
     kept = cloud(against, np.column_stack([before, after]), points // 2)
     kept = kept[np.argsort(against[kept], kind="stable")]
     quantity = (HEIGHT, VELOCITY)[column]
@@ -196,9 +196,9 @@ def corrected_residual_plot(key: str, series: Sequence[FittedSeries], points: in
     """Residual force of the corrected model against height and velocity, at its own scale."""
     panels = _clouds(_residuals(series), _BOTH, points, first=1)
     caption = (
-        "The residual force after the correction, at its own scale: an even band is noise, a pattern "
-        "is a force that the law does not describe, however small. The verdict depends on the error "
-        f"of the height ({_SMOOTHED_BAND})."
+        "The residual force after the correction, at its own scale: an even band is noise, a "
+        "pattern is a force that the law does not describe, however small. The verdict depends on "
+        f"the error of the height ({_SMOOTHED_BAND})."
     )
     return plot(key, "Residual force of the corrected model", caption, panels, 2)
 

@@ -22,6 +22,9 @@ from rig.pages.number_formats import (
 from rig.pages.report.words import LINEAR, is_prescribed, join_words, missing
 
 _NOT_USED = "on data not used for fitting"
+_NOTHING_GAINED = 0.75
+"""Share of the residual force above which a correction is none."""
+
 _POINTS = 121
 _SHARES = (1.0, 0.5)
 """Of the way from mid-stroke (or from rest) to the end at which a law's force is stated."""
@@ -94,6 +97,9 @@ def remainder(diagnosis: Diagnosis) -> Statement:
         text = "On at least one run the error is above the noise: something is still missing."
         return Statement(tone, sign, text)
     above = f"{times(ratio)} times the noise floor" if math.isfinite(ratio) else "floor not known"
+    if force.after > _NOTHING_GAINED * force.before:
+        text = f"No law reduces it ({above}): the given model is as good as any that was found."
+        return Statement(tone, sign, text)
     text = f"{share} of the residual force is left ({above}): something is still missing."
     return Statement(tone, sign, text)
 
@@ -112,7 +118,9 @@ def _headline(diagnosis: Diagnosis) -> str:
         case "nothing_missing":
             return "Nothing is missing"
         case "not_explained":
-            return "A force is missing that no law describes"
+            left_n = diagnosis.held_out.residual_force_rmse_n.after
+            size = f"{quantity(left_n, 'N')} RMS of " if math.isfinite(left_n) else "A "
+            return f"{size}force that no law describes"
         case "ambiguous":
             rivals = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
             either = join_words(names, "and") or "linear corrections"
@@ -166,17 +174,21 @@ def _meaning(result: Result, item: FoundEffect) -> str:
         return f"{_capital(law.words)}: {quantity(item.force_rms_n, 'N')} RMS along the recordings."
     heights = np.concatenate([it.height_m for it in series])
     speeds = np.concatenate([it.velocity_m_per_s for it in series])
-    middle = 0.5 * (float(heights.min()) + float(heights.max()))
+    low_m, high_m = float(heights.min()), float(heights.max())
+    slow, fast = float(speeds.min()), float(speeds.max())
+    middle = 0.5 * (low_m + high_m)
     ends = [
-        [(float(h), 0.0) for h in np.linspace(heights.min(), heights.max(), _POINTS)],
-        [(middle, float(v)) for v in np.linspace(speeds.min(), speeds.max(), _POINTS)],
+        [(float(h), 0.0) for h in np.linspace(low_m, high_m, _POINTS)],
+        [(middle, float(v)) for v in np.linspace(slow, fast, _POINTS)],
     ]
     forces = [[_force(law, item, result, *at) for at in points] for points in ends]
     if not all(math.isfinite(force) for of in forces for force in of):
         return ""
-    over_velocity = np.ptp(forces[1]) > np.ptp(forces[0])
+    spans = [max(of) - min(of) for of in forces]
+    over_velocity = spans[1] > spans[0]
     unit, scale = ("m/s", 1.0) if over_velocity else ("mm", 1e3)
-    points, force = ends[over_velocity], forces[over_velocity]
+    points: list[tuple[float, float]] = ends[int(over_velocity)]
+    force: list[float] = forces[int(over_velocity)]
     largest = int(np.argmax(np.abs(force)))
     centre = _POINTS // 2
     texts: list[str] = []
