@@ -240,18 +240,16 @@ def _rivals(diagnosis: Diagnosis) -> Statement:
     tried = [item for item in diagnosis.rejected if item.left is not None]
     if diagnosis.ambiguous_with:
         rivals = join_words([FAMILY_WORDS[item] for item in diagnosis.ambiguous_with], "and")
-        return Statement("part", "?", f"{_capital(rivals)} cannot be told apart from it here.")
+        text = f"{_capital(rivals)} cannot be distinguished from it in these recordings."
+        return Statement("part", "?", text)
     if diagnosis.verdict == "nothing_missing":
         return Statement("good", "✓", "No law is needed for what these recordings excite.")
     if not tried:
         return Statement("part", "?", "No other law was tried.")
     if not missing(diagnosis):
-        text = (
-            "No law reduces the error further."
-            if diagnosis.verdict == "explained"
-            else (f"None of {len(tried)} laws explains it.")
-        )
-        return Statement("good" if diagnosis.verdict == "explained" else "bad", "✓", text)
+        if diagnosis.verdict == "explained":
+            return Statement("good", "✓", "No law reduces the error further.")
+        return Statement("bad", "✕", f"None of {len(tried)} laws explains it.")
     nearest = tried[0]
     text = (
         f"No rival of {len(tried)} fits as well; the nearest is {effect(nearest.name).words}, "

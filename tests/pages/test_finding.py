@@ -1,0 +1,90 @@
+"""The first screen of a diagnosis: headline, meaning and certainty agree with the verdict."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.diagnosis.outcome import BeforeAfter
+from rig.pages.report.finding import find, remainder
+from tests.pages.test_report import FALLS, FRICTION, MASS, SOFTER, found, report
+
+LEFT = BeforeAfter(2.3e-3, 4e-5)
+
+
+@pytest.mark.parametrize(
+    ("diagnosis", "headline"),
+    [
+        (found(), "Dry friction (Coulomb) missing"),
+        (found("partly_explained", height=LEFT), "Dry friction (Coulomb) and more missing"),
+        (found("nothing_missing", ()), "Nothing is missing"),
+        (
+            found("explained", (), linear=(SOFTER,)),
+            "Spring 13 % softer than in the model; no further effect",
+        ),
+        (
+            found("explained", (), linear=(SOFTER, MASS)),
+            "Spring 13 % softer than in the model and Mass 4.5 % smaller than in the model; no "
+            "further effect",
+        ),
+        (
+            found("ambiguous", ambiguous_with=("damping",)),
+            "Dry friction (Coulomb), or a different damping",
+        ),
+        (found("not_explained", (), LEFT), "0.370 N RMS of force that no law describes"),
+    ],
+)
+def test_the_headline_is_the_finding(diagnosis, headline):
+    assert find(report(diagnosis)).headline.replace("\u00a0", " ") == headline
+
+
+def test_a_force_is_stated_in_newtons_where_it_acts():
+    (meaning,) = find(report()).meaning
+    assert meaning.replace("\u00a0", " ").startswith("Dry friction (Coulomb): 12.1 N at −0.41 m/s")
+
+
+def test_the_error_is_in_one_unit_before_and_after():
+    text = find(report()).error.replace("\u00a0", " ")
+    assert text == "Height error 2.31 → 0.0104 mm on data not used for fitting."
+
+
+@given(
+    st.sampled_from(
+        ["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
+    ),
+    st.floats(0.5, 100.0),
+)
+def test_what_remains_is_judged_as_the_verdict_judges_it(verdict, ratio):
+    effects = (FRICTION,) if verdict not in ("nothing_missing", "not_explained") else ()
+    if verdict in ("explained", "nothing_missing"):
+        ratio = min(ratio, 1.2)
+    diagnosis = found(verdict, effects, BeforeAfter(2e-3, 1e-5 * ratio))
+    statement = remainder(diagnosis)
+    is_noise = verdict in ("explained", "nothing_missing") or (
+        verdict == "ambiguous" and ratio <= 1.2
+    )
+    assert (statement.tone == "good") == is_noise
+    assert ("Only noise is left" in statement.text) == is_noise
+    assert is_noise or "missing" in statement.text or "as good as any" in statement.text
+
+
+def test_a_load_cell_that_does_not_agree_is_said():
+    held_out = replace(found().held_out, strut_force_rmse_n=BeforeAfter(3.0, 9.0))
+    *_, cell = find(report(replace(found(), held_out=held_out))).certainty
+    assert cell.tone == "bad"
+    assert "does not agree" in cell.text
+    *_, cell = find(report()).certainty
+    assert "No load cell" in cell.text
+
+
+def test_a_second_pass_that_gains_nothing_names_the_model_to_keep():
+    held_out = replace(
+        found().held_out,
+        height_rmse_m=BeforeAfter(2.8e-5, 2.7e-5),
+        residual_force_rmse_n=BeforeAfter(0.43, 0.42),
+    )
+    diagnosis = replace(found("not_explained", (), FALLS), held_out=held_out)
+    assert "the given model is as good as any" in remainder(diagnosis).text
+    assert math.isfinite(held_out.residual_force_rmse_n.after)
