@@ -63,8 +63,25 @@ def _print(config: Path, findings: "Sequence[Finding]") -> None:
     from rig.plan.preflight_checks import Severity
 
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
+    by_severity = {
+        severity: [item for item in findings if item.severity is severity]
+        for severity in (Severity.ERROR, Severity.WARNING, Severity.OK)
+    }
+    wrong, doubtful, fine = by_severity.values()
+    counted = [_counted(items, word) for items, word in ((wrong, "error"), (doubtful, "warning"))]
+    said = "; ".join(text for text in counted if text)
+    head = "Not ready" if wrong else "Ready"
+    summary = f"{head}, with {said}." if said else f"{head}: no errors, no warnings."
+    print_text(summary, "red" if wrong else "yellow" if doubtful else "green")
+    findings = [*wrong, *doubtful, *fine]
     rows = [
         (styled(item.severity.value, styles[item.severity]), item.what, item.text)
         for item in findings
     ]
     print_table(("", "What", "Finding"), rows, f"Check of {config}")
+
+
+def _counted(items: "Sequence[Finding]", word: str) -> str:
+    """Findings of a kind, counted and named; empty without one."""
+    names = ", ".join(dict.fromkeys(item.what for item in items))
+    return f"{len(items)} {word}{'s' if len(items) > 1 else ''}: {names}" if items else ""

@@ -181,9 +181,11 @@ def _refuse_bad_end(plan: "Plan", ended: "Ended", folder: Path) -> None:
 
 
 def _why(ended: "Ended") -> str:
-    """Why a run is in its safe state, in brackets."""
-    cause = ended.state.supervised.cause
-    if cause is None:
+    """When and why a run entered its safe state, as the end of a phrase."""
+    from rig.pages.mode_words import describe_cause
+
+    if not ended.cause:
         return ""
-    value = f", {cause.quantity} {cause.value:.4g} beyond {cause.limit:.4g}" * bool(cause.quantity)
-    return f" ({cause.event.value}{value}; events.jsonl has what led there)"
+    since_s = ended.cause.get("t_s")
+    at = f" at {since_s:.1f} s" if isinstance(since_s, float) else ""
+    return f"{at}: {describe_cause(ended.cause)} (events.jsonl has what led there)"

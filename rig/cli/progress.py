@@ -123,28 +123,30 @@ def status_line(
         if not is_due:
             return
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
-        # Faults first: a narrow terminal cuts the end.
-        text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.output.mode.name:<7}"
+        head = f"{look.t_ns * 1e-9:.1f}{total} s  {look.output.mode.name}{_cause_text(look)}"
+        parts = [head, *_describe_faults(look, channels, devices)]
         # The rate since the last line.
         if look.t_ns > shown_ns and look.ticks > shown_ticks:
-            text += f"  {(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz"
+            parts.append(f"{(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz")
         shown_ns, shown_ticks = look.t_ns, look.ticks
-        text += f"  lost {look.counts.lost}"
-        if look.counts.refused:
-            text += f"  refused {look.counts.refused}"
-        text += _describe_faults(look, channels, devices)
-        if look.late_ns is not None:
-            text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
         # Of several struts, the one with the largest force: there is one line.
-        for strut in sorted(look.output.struts, key=lambda item: -abs(item.force_n))[:1]:
-            text += f"  force {strut.force_n:+7.1f} N"
-            text += f"  innovation {strut.innovation_m * 1e3:+7.3f} mm"
-            text += f"  virtual {strut.virtual_force_n:+7.1f} N"
+        strongest = sorted(look.output.struts, key=lambda item: -abs(item.force_n))[:1]
+        for strut in strongest:
+            parts.append(f"force {strut.force_n:+7.1f} N")
+            parts.append(f"height error {strut.innovation_m * 1e3:+7.3f} mm")
+        if look.late_ns is not None:
+            parts.append(f"missed {look.counts.overruns}")
+        parts.append(f"lost {look.counts.lost}")
+        if look.counts.refused:
+            parts.append(f"refused {look.counts.refused}")
+        if look.late_ns is not None:
+            parts.append(f"late ≤ {look.late_ns * 1e-6:.2f} ms")
+        parts += [f"virtual {strut.virtual_force_n:+7.1f} N" for strut in strongest]
         if is_terminal:
             width = shutil.get_terminal_size().columns - 1
-            _write(f"\r{text[:width]:<{width}}".encode())
+            _write(f"\r{_fitting(parts, width):<{width}}".encode())
         else:
-            _write(f"{text.strip()}\n".encode())
+            _write(f"{'  '.join(parts)}\n".encode())
 
     try:
         yield show
@@ -153,13 +155,32 @@ def status_line(
             _write(b"\r\x1b[K")
 
 
-def _describe_faults(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
+def _cause_text(look: "Look") -> str:
+    """Why the estimate is not valid, as the end of a phrase."""
+    from rig.pages.mode_words import describe_cause
+
+    words = describe_cause(look.cause) if look.cause else ""
+    return f": {words}" if words else ""
+
+
+def _fitting(parts: Sequence[str], width: int) -> str:
+    """As many parts as a line has room for, the first ones first; the first is cut if need be."""
+    line = parts[0][:width]
+    for part in parts[1:]:
+        longer = f"{line}  {part}"
+        if len(longer) > width:
+            break
+        line = longer
+    return line
+
+
+def _describe_faults(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> list[str]:
     """A log that is not written, devices at fault, each with the reason, and sensors left out."""
-    text = "" if look.log_fault is None else f"  NOT LOGGED: {look.log_fault}"
-    text += "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
+    parts = [] if look.log_fault is None else [f"NOT LOGGED: {look.log_fault}"]
+    parts += [f"{devices[index]}: {why}" for index, why in look.device_faults]
     if look.output.left_out:
-        text += f"  left out {', '.join(channels[index] for index in look.output.left_out)}"
-    return text
+        parts.append(f"left out {', '.join(channels[index] for index in look.output.left_out)}")
+    return parts
 
 
 @contextlib.contextmanager

@@ -57,7 +57,11 @@ _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "aut
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended; of the model's last divergence strut and time, and what the log lacks."""
+    """How a run ended; of the model's last divergence strut and time, and what the log lacks.
+
+    Attributes:
+        cause: Since when and why it was in its last mode, as in its events; empty if RUNNING.
+    """
 
     folder: Path
     state: BridgeState
@@ -69,6 +73,7 @@ class Ended:
     period_ns: int
     diverged: Mapping[str, object] | None
     dropped_steps: int
+    cause: Mapping[str, object]
 
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
@@ -231,6 +236,7 @@ class _LoggedRun:
             self._plan.period_ns,
             self._divergence(),
             self._log.dropped,
+            self._events.cause_of(self._state.supervised),
         )
 
     def _keep(
@@ -258,6 +264,7 @@ class _LoggedRun:
                     late_ns,
                     result.device_faults,
                     self._log.fault,
+                    self._events.cause_of(self._state.supervised),
                 )
             )
 

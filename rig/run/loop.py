@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from msgspec import Struct
@@ -51,6 +52,7 @@ class Look(NamedTuple):
 
     Attributes:
         t_ns: Time since the first tick, missed ones included.
+        cause: Why the mode is what it is, as in the run's events; empty while it is RUNNING.
     """
 
     t_ns: int
@@ -60,6 +62,7 @@ class Look(NamedTuple):
     late_ns: int | None
     device_faults: tuple[tuple[int, str], ...] = ()
     log_fault: str | None = None
+    cause: Mapping[str, object] = MappingProxyType({})
 
 
 Watch = Callable[[Look], None]

@@ -30,6 +30,7 @@ class ModeEvents:
         self._mode = Mode.INIT
         self._cause: Cause | None = None
         self._events = 0
+        self._since_s = 0.0
         self.ticks = dict.fromkeys(Mode, 0)
         """Ticks in each mode."""
 
@@ -42,7 +43,15 @@ class ModeEvents:
             self._write_request(asked, supervised)
         if mode is not self._mode or _kind_of(cause) != _kind_of(self._cause):
             self._write(state, cause)
+            if mode is not self._mode:
+                self._since_s = supervised.t_ns / 1e9
             self._mode, self._cause = mode, cause
+
+    def cause_of(self, supervised: SupervisedState) -> dict[str, object]:
+        """Why a mode is what it is, as a line of the events; empty while it is RUNNING."""
+        if supervised.mode is Mode.RUNNING:
+            return {}
+        return {"t_s": self._since_s, **self._text(supervised.cause)}
 
     def _write_request(self, asked: Asked, supervised: SupervisedState) -> None:
         line: dict[str, object] = {

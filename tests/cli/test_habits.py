@@ -196,7 +196,7 @@ def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
     for part in (
         "RUNNING",
         "force  -123.4 N",
-        "innovation  +0.020 mm",
+        "height error  +0.020 mm",
         "lost 3",
         "missed 2",
         "late ≤ 0.12 ms",
@@ -204,6 +204,23 @@ def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
         assert part in lines[0]
     assert "\r" not in lines[0]
     assert "\x1b" not in "".join(lines)
+
+
+def test_on_a_terminal_of_80_columns_the_line_has_mode_and_reason(monkeypatch):
+    said = []
+    monkeypatch.setattr("rig.cli.progress._write", lambda text: said.append(text.decode()))
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    cause = {"cause": "beyond_safe", "quantity": "innovation_m", "value": 0.0101, "limit": 0.01}
+    with status_line(60.0) as watch:
+        watch(look(10.0))
+        safe = look(20.0)
+        watch(safe._replace(output=StepOutput(Mode.SAFE, safe.output.struts), cause=cause))
+    running, stopped = (line.strip("\r").rstrip() for line in said[:2])
+    assert max(map(len, (running, stopped))) < 80
+    assert running.startswith("10.0 of 60 s  RUNNING  990 Hz  force  -123.4 N  height error")
+    expected = "20.0 of 60 s  SAFE: height error (innovation) 10.1 mm (limit 10 mm)"
+    assert stopped.replace("\u00a0", " ").startswith(expected)
 
 
 def test_a_line_says_the_rate_that_was_kept(monkeypatch):
