@@ -160,7 +160,8 @@ def _print(
         print_text(
             "This length does not show the direction of the sensor. Next: bring the strut to a "
             "second length, 5 mm or more away, and run "
-            f"`rig zero {config}{strut} --length-m LENGTH`"
+            f"`rig zero {config}{strut} --length-m LENGTH`. If the direction is known, or there is "
+            f"no second length, write reversed: true or false into {channel.key} instead"
         )
         return
     print_text(f"Next: `rig check {config}`")

@@ -1,6 +1,6 @@
 """Which signals of a DBC a new bench uses: those that options name, or the likeliest ones."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from can_dbc.database import Database
@@ -14,6 +14,7 @@ from rig.new_bench.proposal import (
     unclear_forces,
     unknown_units,
 )
+from rig.new_bench.signal_ranking import RankedSignal
 
 _NONE = "none"
 """Instead of a signal's name: the bench does not measure it."""
@@ -78,11 +79,7 @@ def choose_signals(
                 forces[force] = find_force(database, force, item.name)
         unclear = []
     if unclear and len(open_forces) == len(names):
-        item = unclear[0].name
-        raise InputError(
-            f"{item} is a force, and it is not clear where it acts: expected --applied-force "
-            f"{item} for a force on the body, or --load-cell {item} for one in the strut (or none)"
-        )
+        raise InputError(_ask_for_place(unclear))
     chosen = tuple(choice for choice in forces.values() if choice is not None)
     if is_dyno and not any(choice.quantity is Force.IN_STRUT.quantity for choice in chosen):
         raise InputError("--dyno: requires the force in the strut: --load-cell MESSAGE.SIGNAL")
@@ -91,3 +88,29 @@ def choose_signals(
         temperature = find_temperature(database, found.message.sender, given.temperature)
     unknown = tuple(name for name in unknown_units(database) if name != found.name)
     return Signals(found, chosen, temperature, tuple(unclear), unknown)
+
+
+_MOST_LISTED = 6
+_LONGEST_COMMENT = 50
+"""Forces that a message lists, and characters of their comments."""
+
+
+def _ask_for_place(unclear: Sequence[RankedSignal]) -> str:
+    """The forces of which it is not clear where they act, and what is expected."""
+    if len(unclear) == 1:
+        name = unclear[0].name
+        return (
+            f"{name} is a force, and it is not clear where it acts: expected --applied-force "
+            f"{name} for a force on the body, or --load-cell {name} for one in the strut (or none)"
+        )
+    listed = "; ".join(
+        f"{item.name} ({item.signal.comment[:_LONGEST_COMMENT]})"
+        if item.signal.comment
+        else item.name
+        for item in unclear[:_MOST_LISTED]
+    )
+    return (
+        "these are forces, and it is not clear where they act: "
+        f"{listed}; expected --applied-force NAME with the one on the body, and --load-cell NAME "
+        "with the one in the strut, or none"
+    )

@@ -77,7 +77,7 @@ def check(plan: Plan) -> list[Finding]:
     named = plan.database.path.name
     findings = [
         Finding(Severity.OK, "signals", f"all in {named}, units converted to SI"),
-        *map(_protection, read.values()),
+        *(_protection(plan, message) for message in read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
         *map(_sample_times, channel_of.values()),
         *_model(plan),
@@ -138,10 +138,16 @@ def _message(channel: Channel) -> Message:
     return channel.message
 
 
-def _protection(message: Message) -> Finding:
+def _protection(plan: Plan, message: Message) -> Finding:
     what, protection = f"protection of {message.name}", message.protection
     if protection is None:
+        signals = plan.config.signals
+        entries = [*signals.height.values(), *signals.bench.values()]
+        entries += [entry for group in signals.further.values() for entry in group.values()]
+        own = [entry for entry in entries if entry.message == message.name]
         text = "none in the DBC: a corrupted, repeated or foreign frame passes as data"
+        if any(entry.counter for entry in own):
+            text = "no checksum in the DBC: a corrupted frame whose counter is right passes as data"
         return Finding(Severity.WARNING, what, text)
     return Finding(Severity.OK, what, f"E2E profile {protection.identity.profile.value}")
 
@@ -211,7 +217,7 @@ def _zero(plan: Plan, height: Channel) -> Finding:
         text = f"a reading of {zero.reads * 1e3:g} mm is a length of {zero.at_m * 1e3:g} mm"
         if "reversed" not in entry.model_fields_set:
             text += f"; not known whether the sensor is reversed: expected {measure} at a second "
-            text += "length, or reversed: false"
+            text += "length, or reversed: true or false in the entry"
             return Finding(Severity.WARNING, what, text)
         return Finding(Severity.OK, what, text + (", reversed" if entry.reversed else ""))
     if _message(height).signal(height.signal).offset:
@@ -336,7 +342,7 @@ def _switches(plan: Plan) -> list[Finding]:
             text = f"open after {safe_ns * 1e-6:g} ms without {message.name}"
             findings.append(Finding(Severity.OK, what, text))
         if message not in [_message(height) for height in plan.heights]:
-            findings.append(_protection(message))
+            findings.append(_protection(plan, message))
     return findings
 
 

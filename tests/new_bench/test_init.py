@@ -1,6 +1,7 @@
 """`rig init`, from a DBC to a configuration that can be checked, with and without a terminal."""
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -48,6 +49,19 @@ def test_what_is_written_passes_the_check(rig, tmp_path, capsys):
     assert plan.config.signals.applied_force.signal == "Force"
     assert rig(*FACTS) == 2
     assert "--out my.yaml: exists, expected a new file" in capsys.readouterr().err
+
+
+def test_all_forces_of_unclear_place_are_listed_with_their_comments(rig, tmp_path, capsys):
+    text = (tmp_path / "my.dbc").read_text()
+    other = ' SG_ ForceB : 16|16@1- (0.1,0) [0|0] "daN" CONTROL\n\nBO_ 400'
+    text = text.replace('"daN" CONTROL\n\nBO_ 400', f'"daN" CONTROL\n{other}')
+    number = re.search(r"BO_ (\d+) CELL", text)[1]
+    (tmp_path / "my.dbc").write_text(f'{text}\nCM_ SG_ {number} ForceB "from pressures";\n')
+    assert rig(*FACTS) == 2
+    said = capsys.readouterr().err
+    assert "these are forces" in said
+    assert "CELL.Force" in said
+    assert "CELL.ForceB (from pressures)" in said
 
 
 def test_where_a_force_acts_is_asked_for_before_anything_is_written(rig, tmp_path, capsys):
