@@ -9,13 +9,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from rig.guide import PAGES
+import rig.guide
 from tests.view.browser import browser, drawn
 from tests.view.serving import serving
 from tests.view.states import STATES, make_state, touch
 
-IMAGES = PAGES / "images"
-MODES = ("waiting", "settling", "hold", "safe_silent", "safe_innovation", "ready")
+IMAGES = Path(rig.guide.__file__).parent / "pages" / "images"
+MODES = ("waiting", "hold", "safe_innovation", "ready")
 """States whose banners a page of the guide shows."""
 
 

@@ -113,7 +113,7 @@ def _deciding(diagnosis: Diagnosis) -> tuple[BeforeAfter, float]:
 
 
 def _headline(diagnosis: Diagnosis) -> str:
-    names = [effect(item.name).words for item in missing(diagnosis)]
+    names = [_bare(effect(item.name).words) for item in missing(diagnosis)]
     match diagnosis.verdict:
         case "nothing_missing":
             return "Nothing is missing"
@@ -135,6 +135,11 @@ def _headline(diagnosis: Diagnosis) -> str:
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
     more = "more is missing" if diagnosis.verdict == "partly_explained" else "no further effect"
     return f"{_capital(join_words(parts, 'and') or 'parameters off')}; {more}"
+
+
+def _bare(words: str) -> str:
+    """Words without their article."""
+    return words.removeprefix("a ").removeprefix("an ")
 
 
 def _direction(item: LinearCorrection) -> str:
@@ -171,7 +176,8 @@ def _meaning(result: Result, item: FoundEffect) -> str:
     if not series or set(item.parameters) != {it.name for it in law.parameters}:
         return ""
     if law.states or law.adds_mass:
-        return f"{_capital(law.words)}: {quantity(item.force_rms_n, 'N')} RMS along the recordings."
+        rms = quantity(item.force_rms_n, "N")
+        return f"{_capital(_bare(law.words))}: {rms} RMS along the recordings."
     heights = np.concatenate([it.height_m for it in series])
     speeds = np.concatenate([it.velocity_m_per_s for it in series])
     low_m, high_m = float(heights.min()), float(heights.max())
@@ -199,7 +205,7 @@ def _meaning(result: Result, item: FoundEffect) -> str:
             f"{quantity(force[at], 'N')} at {with_unit(number(x, 2 - 2 * (unit == 'mm')), unit)}"
         )
     where = "" if over_velocity else " of height"
-    return f"{_capital(law.words)}: {', '.join(texts)}{where}."
+    return f"{_capital(_bare(law.words))}: {', '.join(texts)}{where}."
 
 
 def _force(
@@ -253,7 +259,7 @@ def _rivals(diagnosis: Diagnosis) -> Statement:
     nearest = tried[0]
     text = (
         f"No rival of {len(tried)} fits as well; the nearest is {effect(nearest.name).words}, "
-        f"which leaves {percent(nearest.left, 0)} of the linear model's residual."
+        f"which leaves {percent(nearest.left, 1)} of the linear model's residual."
     )
     return Statement("good", "✓", text)
 
