@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from rig.log.reader import read_run
+from rig.pages.number_formats import number
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
 from rig.run.changed_settings import read_changes
@@ -261,6 +262,20 @@ def test_tiles_hold_what_the_log_holds(made, states):
         until(opened, "document.querySelector('#tile-height .big').textContent.includes('in')")
         shown = opened.locator("#tile-height .big").inner_text()
         assert float(shown.removesuffix(" in")) == pytest.approx(height_m / 0.0254, abs=1e-4)
+
+
+def test_numbers_are_written_as_in_the_reports(opened):
+    """The page's script and the reports have one rule in two languages."""
+    rng = np.random.default_rng(11)
+    values = (rng.standard_normal(300) * 10.0 ** rng.uniform(-3.0, 6.0, 300)).tolist()
+    decimals = rng.integers(0, 5, 300).tolist()
+    given = list(zip(values, decimals, strict=True))
+    shown = opened.evaluate("(pairs) => pairs.map(([v, d]) => Charts.fixed(v, d))", given)
+    expected = [number(value, count) for value, count in given]
+    # A value that rounds to zero has no sign on the page.
+    assert shown == [
+        text.lstrip("\u2212") if not re.search("[1-9]", text) else text for text in expected
+    ]
 
 
 def test_tabs_are_reached_by_keyboard(opened):
