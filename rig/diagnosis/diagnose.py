@@ -142,11 +142,11 @@ def _explore_twice(
     """
     given, linear = fits
     first = Pool(problem, given, [linear], criteria)
-    first_round = explore(first, within(progress, 0.0, 0.55))
+    first_round = explore(first, within(progress, 0.0, 0.3))
     problem = _with_residual_noise(problem, first.chosen(criteria.most_laws).fit)
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
-    explore(second, within(progress, 0.55, 1.0))
+    explore(second, within(progress, 0.3, 1.0))
     return first, second, first_round
 
 

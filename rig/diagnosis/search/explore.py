@@ -32,6 +32,8 @@ _IMITATED = ("friction", "nonlinear_damping", "hysteresis")
 """Families of which one law may imitate friction together with the valves of a damper."""
 _EXPLORED = 0.85
 """Share of a search's progress that its rounds take; in the rest the best models converge."""
+_REST_AFTER_TURN = 0.6
+"""Share of the work that is left after one more expansion: there are mostly two to four."""
 
 
 class FirstRound(NamedTuple):
@@ -127,13 +129,13 @@ def _gains(pool: Pool, stage: Stage, before: Screening, after: Screening) -> boo
 def _expand_best(pool: Pool, progress: Progress) -> None:
     """Add laws to the best model and exchange its laws; repeat with the new best one."""
     expanded: set[Candidate] = set()
-    turns = 2 * pool.criteria.most_laws
-    for turn in range(turns):
+    for turn in range(2 * pool.criteria.most_laws):
         reference = pool.next_to_expand()
         if pool.at_floor(pool.converge_least()) or reference.fit.candidate in expanded:
             return
         expanded.add(reference.fit.candidate)
-        _expand(pool, reference, within(progress, turn / turns, (turn + 1) / turns))
+        begin, end = 1.0 - _REST_AFTER_TURN**turn, 1.0 - _REST_AFTER_TURN ** (turn + 1)
+        _expand(pool, reference, within(progress, begin, end))
 
 
 def _expand(pool: Pool, reference: ValidatedModel, progress: Progress) -> None:
