@@ -14,6 +14,10 @@ _SECANT_M, USUAL_SPEED_M_PER_S = 2e-3, 0.1
 """Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
 steep at rest, counts as it acts in motion."""
 
+FAST_SPEED_M_PER_S = 0.5
+"""Speed beyond the knee of nearly every damper, at which a loop has to be stable, too, where no run
+shows how fast its bench is."""
+
 _SPEEDS_M_PER_S = np.geomspace(0.05, 10.0, 24)
 """At which a strut has to dissipate: from a slow motion to three times that of a fast bench."""
 

@@ -21,7 +21,11 @@ from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWI
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
-from rig.closed_loop.strut_response import find_driving_speeds_m_per_s, strut_responses
+from rig.closed_loop.strut_response import (
+    FAST_SPEED_M_PER_S,
+    find_driving_speeds_m_per_s,
+    strut_responses,
+)
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, vital_channels
@@ -29,9 +33,6 @@ from rig.plan.plan import Plan, vital_channels
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
 to one third."""
-
-_FAST_M_PER_S = 0.5
-"""Speed beyond the knee of nearly every damper, at which a loop is checked, too."""
 
 _IN_STEP = "virtual"
 """Interface within one process: a simulated bench on it is in step with the bridge."""
@@ -536,14 +537,15 @@ def _in_motion(plan: Plan, plant: AnyPlant, rest: Sequence[float], timing: Sampl
         if end is not None and end > 0.0
     ]
     heights = [rest, *((end, *rest[1:]) for end in ends)]
-    points = [OperatingPoint(at, _FAST_M_PER_S) for at in heights]
+    points = [OperatingPoint(at, FAST_SPEED_M_PER_S) for at in heights]
     responses = strut_responses(plant, rest)
     ratio, point = least_damping(plant, plan.observers, timing, responses, points)
-    text = f"least damping ratio {ratio:.3f} at {_FAST_M_PER_S:g} m/s"
+    text = f"least damping ratio {ratio:.3f} at {FAST_SPEED_M_PER_S:g} m/s"
     if point is not None and ratio < 0.0:
         text = (
-            f"at {_FAST_M_PER_S:g} m/s and {point.heights_m[0]:.4g} m, errors grow (damping ratio "
-            f"{ratio:.3f}): choose other gains by `rig tune --run` with a run of the usual motion"
+            f"at {FAST_SPEED_M_PER_S:g} m/s and {point.heights_m[0]:.4g} m, errors grow (damping "
+            f"ratio {ratio:.3f}): choose other gains by `rig tune --run` with a run of the usual "
+            "motion"
         )
         return Finding(Severity.WARNING, "poles in motion", text)
     return Finding(Severity.OK, "poles in motion", text)

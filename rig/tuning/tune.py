@@ -1,7 +1,7 @@
 """From a configuration and a run to a configuration with tuned observers."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -13,10 +13,15 @@ if TYPE_CHECKING:
 from can_dbc.codec import si_step
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text
+from dart_model.protocol import AnyPlant
 from rig.channels.channel import Channel
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import OperatingPoint
-from rig.closed_loop.strut_response import StrutResponse, strut_responses
+from rig.closed_loop.strut_response import (
+    FAST_SPEED_M_PER_S,
+    StrutResponse,
+    strut_responses,
+)
 from rig.diagnosis.progress import Progress, within
 from rig.files.yaml_edit import edit_keys
 from rig.log.reader import read_run
@@ -43,9 +48,6 @@ from rig.tuning.gains import (
     tune_observer,
 )
 from rig.tuning.latency import Latency, estimate_latency, with_delay
-
-_FAST_M_PER_S = 0.5
-"""Speed at which a loop has to be stable where no run shows how fast its bench is."""
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
 """Of the bandwidths that are plotted: from a sixth to six times the choice."""
@@ -114,61 +116,23 @@ def tune(
             f"{0.5e9 / plan.period_ns:g}"
         )
     plant = build_plant(plan)
-    heights_m = [strut.free_length_m for strut in plan.struts]
-    responses = strut_responses(plant, heights_m)
+    at_rest_m = [strut.free_length_m for strut in plan.struts]
+    responses = strut_responses(plant, at_rest_m)
     progress("reading what is to be expected", 0.0)
     steps = read_run(source).steps if isinstance(source, Path) else None
-    expectations = _expectations(plan, source, steps, responses)
-    points = [OperatingPoint(heights_m, _FAST_M_PER_S)]
+    points = [OperatingPoint(at_rest_m, FAST_SPEED_M_PER_S)]
     if steps is not None:
         points = operating_points(steps, plan.strut_names) or points
-    others = _before_tuning(plan, expectations)
-    if isinstance(source, Path) and plan_of_run(source).model != plan.model:
-        # With the run's frames, and observers that are stable with the other model.
+    loops = _Loops(plan, plant, responses, points, _expectations(plan, source, steps, responses))
+    if isinstance(source, Path) and (recorded := plan_of_run(source)).model != plan.model:
         progress("the run with this model", 0.0)
-        followers = {
-            strut.name: tune_observer(
-                TuningProblem(
-                    plant,
-                    others,
-                    index,
-                    responses,
-                    heights_m,
-                    SampleTiming.of(plan.period_ns, strut.interval_ns, 0),
-                    expectations[index],
-                    cast("AnyTunableObserver", strut.observer).force_limit_n,
-                    points,
-                ),
-                "kalman",
-                aim,
-            ).observer
-            for index, strut in enumerate(plan.struts)
-        }
-        own = plan_of_run(source).with_model(plan.model).with_observers(followers)
-        steps = replay(source, plan=own).steps
-        expectations = _expectations(plan, source, steps, responses)
-        others = _before_tuning(plan, expectations)
+        loops = _follow_with_own_model(loops, recorded, source, aim)
     tuned: list[TunedStrut] = []
     for index, strut in enumerate(plan.struts):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
         part = within(progress, *share, of=strut.name)
-
-        def problem_at(delay_s: float, index: int = index) -> TuningProblem:
-            interval_ns, observer = plan.struts[index].interval_ns, plan.struts[index].observer
-            return TuningProblem(
-                plant,
-                others,
-                index,
-                responses,
-                heights_m,
-                SampleTiming.of(plan.period_ns, interval_ns, round(delay_s * 1e9)),
-                expectations[index],
-                cast("AnyTunableObserver", observer).force_limit_n,
-                points,
-            )
-
-        latency, delay_s = _find_delay(plan, source, problem_at, aim, part)
-        problem = problem_at(delay_s)
+        latency, delay_s = _find_delay(loops, index, source, aim, part)
+        problem = loops.problem(index, delay_s)
         part("gains", 0.7)
         chosen = tune_observer(problem, kind, aim)
         part("other bandwidths", 0.9)
@@ -208,27 +172,67 @@ def _expectations(
     return found
 
 
-def _before_tuning(plan: Plan, expectations: Sequence[Expectation]) -> tuple[KalmanObserver, ...]:
-    """Observers of the struts whose turn has not come."""
-    return tuple(
-        KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
-        for item, strut in zip(expectations, plan.struts, strict=True)
-    )
+def _follow_with_own_model(loops: "_Loops", recorded: Plan, run: Path, aim: Aim) -> "_Loops":
+    """The loops, with what is to be expected of a run that another model followed.
+
+    Its frames are replayed, with observers that are stable with the model that is tuned.
+    """
+    plan = loops.plan
+    followers = {
+        strut.name: tune_observer(loops.problem(index, 0.0), "kalman", aim).observer
+        for index, strut in enumerate(plan.struts)
+    }
+    own = recorded.with_model(plan.model).with_observers(followers)
+    steps = replay(run, plan=own).steps
+    return loops._replace(expectations=_expectations(plan, run, steps, loops.responses))
+
+
+class _Loops(NamedTuple):
+    """The loops of a plan's struts, of each of which an observer is tuned.
+
+    Attributes:
+        plan: The configuration.
+        plant: Its model.
+        responses: Response of each strut.
+        points: Motions in which the loops have to be stable.
+        expectations: What the observer of each strut has to expect.
+    """
+
+    plan: Plan
+    plant: AnyPlant
+    responses: Sequence[StrutResponse]
+    points: Sequence[OperatingPoint]
+    expectations: Sequence[Expectation]
+
+    def problem(self, index: int, delay_s: float) -> TuningProblem:
+        """What is to be tuned of a strut whose height has a delay."""
+        struts = self.plan.struts
+        others = tuple(
+            KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
+            for item, strut in zip(self.expectations, struts, strict=True)
+        )
+        return TuningProblem(
+            self.plant,
+            others,
+            index,
+            self.responses,
+            [strut.free_length_m for strut in struts],
+            SampleTiming.of(self.plan.period_ns, struts[index].interval_ns, round(delay_s * 1e9)),
+            self.expectations[index],
+            cast("AnyTunableObserver", struts[index].observer).force_limit_n,
+            self.points,
+        )
 
 
 def _find_delay(
-    plan: Plan,
-    source: Path | StatedExpectation,
-    problem_at: Callable[[float], TuningProblem],
-    aim: Aim,
-    progress: Progress,
+    loops: _Loops, index: int, source: Path | StatedExpectation, aim: Aim, progress: Progress
 ) -> tuple[Latency | None, float]:
     """Latency of a height as the run shows it, None where it is given, and the delay to tune with.
 
     The configuration gives the delay, or the run does where that gives none.
     """
-    at_once = problem_at(0.0)
-    strut = plan.struts[at_once.strut].name
+    plan = loops.plan
+    strut = plan.struts[index].name
     delay_s = plan.config.signals.height[strut].delay_s
     if delay_s or not isinstance(source, Path):
         return None, delay_s
@@ -236,13 +240,14 @@ def _find_delay(
     own = plan_of_run(source).with_model(plan.model)
 
     def follow(delay_s: float) -> KalmanObserver:
-        return cast("KalmanObserver", tune_observer(problem_at(delay_s), "kalman", aim).observer)
+        tuned = tune_observer(loops.problem(index, delay_s), "kalman", aim)
+        return cast("KalmanObserver", tuned.observer)
 
     latency = estimate_latency(
         source,
         own,
         strut,
-        at_once.mobility_per_kg,
+        loops.responses[index].mobility_per_kg,
         follow,
         lambda share: progress("latency", 0.7 * share),
     )
