@@ -63,11 +63,10 @@ def _print(config: Path, findings: "Sequence[Finding]") -> None:
     from rig.plan.preflight_checks import Severity
 
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
-    by_severity = {
-        severity: [item for item in findings if item.severity is severity]
+    wrong, doubtful, fine = (
+        [item for item in findings if item.severity is severity]
         for severity in (Severity.ERROR, Severity.WARNING, Severity.OK)
-    }
-    wrong, doubtful, fine = by_severity.values()
+    )
     counted = [_counted(items, word) for items, word in ((wrong, "error"), (doubtful, "warning"))]
     said = "; ".join(text for text in counted if text)
     head = "Not ready" if wrong else "Ready"

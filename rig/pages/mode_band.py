@@ -55,10 +55,20 @@ def parse_events(lines: bytes) -> list[LoggedEvent]:
     return events
 
 
+def time_s(event: LoggedEvent) -> float:
+    """Time of an event since the first tick, s."""
+    return float(str(event["t_s"]))
+
+
+def last_entry(events: Sequence[LoggedEvent], mode: Mode) -> LoggedEvent | None:
+    """The event that entered a mode last; None without one."""
+    return next((it for it in reversed(events) if it.get("to") == mode.name), None)
+
+
 def make_band(events: Sequence[LoggedEvent], begin_s: float, end_s: float) -> list[BandPiece]:
     """The modes between two times, stretch by stretch."""
     changes = [
-        (float(str(event["t_s"])), Mode[str(event["to"])])
+        (time_s(event), Mode[str(event["to"])])
         for event in events
         if event.get("to") in Mode.__members__
     ]
@@ -96,7 +106,7 @@ def _piece_at(t_s: float, begin_s: float, end_s: float) -> int:
 
 
 def _in_words(event: LoggedEvent, *, with_strut: bool) -> ListedEvent:
-    t_s = float(str(event["t_s"]))
+    t_s = time_s(event)
     if "request" in event:
         refused = ", refused" if event.get("refused") else ""
         return ListedEvent(t_s, f"{event['request']}{refused}", f"by {event.get('by')}")

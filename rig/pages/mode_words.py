@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from rig.bridge.mode_supervisor import Event
 from rig.bridge.values import Mode
-from rig.pages.number_formats import number, with_unit
+from rig.pages.number_formats import three_digits, with_unit
 
 LoggedEvent = Mapping[str, object]
 """A line of a run's events: time, modes, cause with its quantity, value and limit (SI)."""
@@ -148,11 +148,9 @@ def _amount(value: object, unit: str) -> str:
     """A value with three digits at most, lengths in mm; empty where there is no number."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return ""
-    factor, unit = {"m": (1e3, "mm"), "s": (1.0, "s"), "%": (1e2, "%")}.get(unit, (1.0, unit))
+    factor, unit = {"m": (1e3, "mm"), "%": (1e2, "%")}.get(unit, (1.0, unit))
     if unit == "s" and abs(value) < 1.0:
         factor, unit = 1e3, "ms"
-    scaled = factor * float(value)
-    decimals = 2 - math.floor(math.log10(abs(scaled))) if scaled else 0
-    text = number(scaled, decimals)
+    text = three_digits(factor * float(value))
     text = text.rstrip("0").rstrip(".") if "." in text else text
     return with_unit(text, unit)

@@ -20,6 +20,11 @@ def number(value: float, decimals: int) -> str:
     return text.replace("-", _MINUS)
 
 
+def three_digits(value: float) -> str:
+    """A number with three digits."""
+    return number(value, 2 - math.floor(math.log10(abs(value)))) if value else "0"
+
+
 def decimals_of(uncertainty: float) -> int:
     """Decimals that show the first two digits of an uncertainty."""
     return 1 - math.floor(math.log10(uncertainty))
@@ -45,8 +50,7 @@ def quantity(value: float, unit: str) -> str:
         return with_unit("0", unit)
     if not 1e-3 <= abs(scaled) < 1e7:
         return with_unit(f"{scaled:.2e}".replace("-", _MINUS), name)
-    decimals = 2 - math.floor(math.log10(abs(scaled)))
-    return with_unit(number(scaled, decimals), name)
+    return with_unit(three_digits(scaled), name)
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -109,6 +113,11 @@ def percent(share: float | None, decimals: int) -> str:
     if share is None or not math.isfinite(share):
         return "–"
     return f"{number(100.0 * share, decimals)}{_NO_BREAK}%"
+
+
+def capital(text: str) -> str:
+    """The text with a capital first letter."""
+    return text[:1].upper() + text[1:]
 
 
 def label(parameter: Parameter) -> str:

@@ -1,5 +1,6 @@
 """The report of a run: configuration, timing, faults and curves. One file, no network."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from rig.log.checksums import Damage, find_damage, refuse_damage
 from rig.log.follower import FORCE_ERROR, RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
-from rig.pages.mode_band import list_events, make_band, read_events
+from rig.pages.mode_band import last_entry, list_events, make_band, read_events, time_s
 from rig.pages.mode_words import COUNT_WORDS, LoggedEvent, describe_cause
 from rig.pages.number_formats import number, percent, quantity
 from rig.pages.plotted_quantities import (
@@ -54,6 +55,8 @@ _KILLED = ("part", "◐", "Killed, or still running")
 _NOT_ALWAYS_VALID = ("part", "◐", "Ended in order, not valid all the time")
 _MOST_COMPARED = 3_600_000
 """Cycles at the end of a run over which the force error is computed: an hour at 1 kHz."""
+_CYCLES_AT_ONCE = 60_000
+"""Cycles that are held in memory for it."""
 
 _LOST_MODES = ("HOLD", "SAFE")
 
@@ -123,15 +126,16 @@ def _accuracy(follower: RunFollower) -> str:
     """How far the valid estimates were from the load cell, as a sentence."""
     if LOAD_CELL.column not in follower.columns:
         return "No load cell was logged: the accuracy of the estimated force is not known."
-    rows = follower.rows(max(0, follower.steps - _MOST_COMPARED), follower.steps)
-    error, cell = (
-        rows[:, follower.columns.index(name)] for name in (FORCE_ERROR, LOAD_CELL.column)
-    )
-    error = error[np.isfinite(error)]
-    if not len(error):
+    columns = [follower.columns.index(name) for name in (FORCE_ERROR, LOAD_CELL.column)]
+    squares_n2, count, peak_n = 0.0, 0, 0.0
+    for begin in range(max(0, follower.steps - _MOST_COMPARED), follower.steps, _CYCLES_AT_ONCE):
+        error, cell = follower.rows(begin, begin + _CYCLES_AT_ONCE)[:, columns].T
+        error = error[np.isfinite(error)]
+        squares_n2, count = squares_n2 + float(error @ error), count + len(error)
+        peak_n = float(np.fmax.reduce(np.abs(cell), initial=peak_n))
+    if not count:
         return "No valid estimate coincides with a sample of the load cell."
-    rms_n = float(np.sqrt(np.mean(error**2)))
-    peak_n = float(np.nanmax(np.abs(cell)))
+    rms_n = math.sqrt(squares_n2 / count)
     share = f" ({percent(rms_n / peak_n, 1)} of the peak, {quantity(peak_n, 'N')})" * (peak_n > 0)
     return f"Estimated force within {quantity(rms_n, 'N')} RMS{share} of the load cell."
 
@@ -140,12 +144,10 @@ def _cause_of_end(events: Sequence[LoggedEvent], ending: Ending, *, with_strut: 
     """When and why a run entered the safe state in which it ended; empty where it did not."""
     if ending.get("status") != "safe":
         return ""
-    last = next((it for it in reversed(events) if it.get("to") == Mode.SAFE.name), None)
+    last = last_entry(events, Mode.SAFE)
     if last is None:
         return ""
-    return (
-        f"SAFE at {float(str(last['t_s'])):.1f} s: {describe_cause(last, with_strut=with_strut)}."
-    )
+    return f"SAFE at {time_s(last):.1f} s: {describe_cause(last, with_strut=with_strut)}."
 
 
 def _modes(ending: Ending) -> str:

@@ -1,20 +1,23 @@
 """The first screen of a diagnosis: what was found, what it means, and how certain that is."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from dart_model.effects import FAMILY_WORDS, Effect, effect
+from dart_model.effects import AMBIENT_C, FAMILY_WORDS, Effect, effect
 from dart_model.effects.calling import force_over_arrays
 from rig.diagnosis.outcome import BeforeAfter, Diagnosis, FoundEffect, LinearCorrection, Result
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.number_formats import (
+    capital,
     decimals_of,
     label,
     number,
     percent,
     quantity,
+    three_digits,
     times,
     value_and_interval,
     with_unit,
@@ -26,6 +29,9 @@ _NOTHING_GAINED = 0.75
 """Share of the residual force above which a correction is none."""
 
 _POINTS = 121
+"""Points along the travel, and along the speeds, among which the largest force of a law is found:
+each is within a hundredth of the next."""
+
 _SHARES = (1.0, 0.5)
 """Of the way from mid-stroke (or from rest) to the end at which a law's force is stated."""
 
@@ -90,10 +96,6 @@ def remainder(diagnosis: Diagnosis) -> Statement:
     share = percent(force.after / force.before, 1) if force.before > 0.0 else "–"
     tone, sign = ("bad", "✕") if diagnosis.verdict == "not_explained" else ("part", "◐")
     if is_at_floor:
-        if diagnosis.verdict == "ambiguous":
-            return Statement(
-                "good", "✓", f"Only noise is left: {times(ratio)} times the noise floor."
-            )
         text = "On at least one run the error is above the noise: something is still missing."
         return Statement(tone, sign, text)
     above = f"{times(ratio)} times the noise floor" if math.isfinite(ratio) else "floor not known"
@@ -125,16 +127,16 @@ def _headline(diagnosis: Diagnosis) -> str:
             rivals = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
             either = join_words(names, "and") or "linear corrections"
             others = join_words(rivals, "or") or "another law that fits as well"
-            return f"{_capital(either)}, or {others}"
+            return f"{capital(either)}, or {others}"
         case _:
             pass
     if names:
         also = " and more" if diagnosis.verdict == "partly_explained" else ""
-        return f"{_capital(join_words(names, 'and'))}{also} missing"
+        return f"{capital(join_words(names, 'and'))}{also} missing"
     parts = [_direction(item) for item in diagnosis.linear]
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
     more = "more is missing" if diagnosis.verdict == "partly_explained" else "no further effect"
-    return f"{_capital(join_words(parts, 'and') or 'parameters off')}; {more}"
+    return f"{capital(join_words(parts, 'and') or 'parameters off')}; {more}"
 
 
 def _bare(words: str) -> str:
@@ -162,7 +164,7 @@ def _values(diagnosis: Diagnosis) -> tuple[str, ...]:
             if parameter.name in law.shown and parameter.name in item.parameters:
                 estimate = item.parameters[parameter.name]
                 value, interval = value_and_interval(estimate, parameter.unit)
-                texts.append(f"{_capital(label(parameter))} {value} (95 %: {interval})")
+                texts.append(f"{capital(label(parameter))} {value} (95 %: {interval})")
     for item in diagnosis.linear:
         value, interval = value_and_interval(item.total, LINEAR[item.parameter][1])
         texts.append(f"{_direction(item)}: {value} (95 %: {interval})")
@@ -177,7 +179,7 @@ def _meaning(result: Result, item: FoundEffect) -> str:
         return ""
     if law.states or law.adds_mass:
         rms = quantity(item.force_rms_n, "N")
-        return f"{_capital(_bare(law.words))}: {rms} RMS along the recordings."
+        return f"{capital(_bare(law.words))}: {rms} RMS along the recordings."
     heights = np.concatenate([it.height_m for it in series])
     speeds = np.concatenate([it.velocity_m_per_s for it in series])
     low_m, high_m = float(heights.min()), float(heights.max())
@@ -187,7 +189,8 @@ def _meaning(result: Result, item: FoundEffect) -> str:
         [(float(h), 0.0) for h in np.linspace(low_m, high_m, _POINTS)],
         [(middle, float(v)) for v in np.linspace(slow, fast, _POINTS)],
     ]
-    forces = [[_force(law, item, result, *at) for at in points] for points in ends]
+    force_at = _force_of(law, item, result)
+    forces = [[force_at(*at) for at in points] for points in ends]
     if not all(math.isfinite(force) for of in forces for force in of):
         return ""
     spans = [max(of) - min(of) for of in forces]
@@ -205,22 +208,25 @@ def _meaning(result: Result, item: FoundEffect) -> str:
             f"{quantity(force[at], 'N')} at {with_unit(number(x, 2 - 2 * (unit == 'mm')), unit)}"
         )
     where = "" if over_velocity else " of height"
-    return f"{_capital(_bare(law.words))}: {', '.join(texts)}{where}."
+    return f"{capital(_bare(law.words))}: {', '.join(texts)}{where}."
 
 
-def _force(
-    law: Effect, item: FoundEffect, result: Result, height_m: float, velocity: float
-) -> float:
+def _force_of(law: Effect, item: FoundEffect, result: Result) -> Callable[[float, float], float]:
+    """Force of a found law, N, at a height (m) and velocity (m/s); NaN where it has no value."""
     values = [item.parameters[parameter.name].value for parameter in law.parameters]
-    strut = next((it for it in result.corrected.struts if it.name == item.strut), None)
-    constants = (height_m, 0.0, 0.0, result.corrected.gravity_m_per_s2)
-    if strut is not None:
-        of_strut = strut.free_length_m, strut.stiffness_n_per_m, strut.damping_n_s_per_m
-        constants = (*of_strut, result.corrected.gravity_m_per_s2)
-    try:
-        return force_over_arrays(law)(0.0, height_m, velocity, 0.0, 20.0, (), values, constants)
-    except (ArithmeticError, ValueError):
-        return math.nan
+    strut = next(it for it in result.corrected.struts if it.name == item.strut)
+    of_strut = strut.free_length_m, strut.stiffness_n_per_m, strut.damping_n_s_per_m
+    constants = (*of_strut, result.corrected.gravity_m_per_s2)
+    force_n = force_over_arrays(law)
+
+    def force_at(height_m: float, velocity_m_per_s: float) -> float:
+        try:
+            motion = 0.0, height_m, velocity_m_per_s, 0.0, AMBIENT_C
+            return force_n(*motion, (), values, constants)
+        except (ArithmeticError, ValueError):
+            return math.nan
+
+    return force_at
 
 
 def _error(diagnosis: Diagnosis) -> str:
@@ -231,22 +237,17 @@ def _error(diagnosis: Diagnosis) -> str:
         name, factor, unit = "Force error", 1.0, "N"
     else:
         name, factor, unit = "Height error", 1e3, "mm"
-    before, after = (_three(factor * it) for it in (figure.before, figure.after))
+    before, after = (three_digits(factor * it) for it in (figure.before, figure.after))
     if diagnosis.verdict == "nothing_missing" and before == after:
         return f"{name} {with_unit(before, unit)} {_NOT_USED}."
     return f"{name} {before} → {with_unit(after, unit)} {_NOT_USED}."
-
-
-def _three(value: float) -> str:
-    """A number with three digits."""
-    return number(value, 2 - math.floor(math.log10(abs(value)))) if value else "0"
 
 
 def _rivals(diagnosis: Diagnosis) -> Statement:
     tried = [item for item in diagnosis.rejected if item.left is not None]
     if diagnosis.ambiguous_with:
         rivals = join_words([FAMILY_WORDS[item] for item in diagnosis.ambiguous_with], "and")
-        text = f"{_capital(rivals)} cannot be distinguished from it in these recordings."
+        text = f"{capital(rivals)} cannot be distinguished from it in these recordings."
         return Statement("part", "?", text)
     if diagnosis.verdict == "nothing_missing":
         return Statement("good", "✓", "No law is needed for what these recordings excite.")
@@ -274,7 +275,3 @@ def _load_cell(diagnosis: Diagnosis) -> Statement:
         return Statement("good", "✓", text)
     text = f"The load cell does not agree: its difference goes from {before} to {after} RMS."
     return Statement("bad", "✕", text)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -10,7 +10,7 @@ from dart_model.spec import dump_model
 from rig.diagnosis.outcome import Diagnosis, FittedSeries, Result
 from rig.machine.installed_versions import version_of
 from rig.pages.html import render_report, write_page
-from rig.pages.number_formats import percent
+from rig.pages.number_formats import capital, percent
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,
@@ -90,6 +90,7 @@ def page(result: Result) -> str:
         struts=struts,
         is_corrected=_has_corrections(diagnosis),
         tables=tables,
+        capital=capital,
         found=find(result),
         finding_plot=_finding_plot(result),
         corrected=_corrected_text(result),

@@ -165,8 +165,3 @@ def excitations(family: str) -> str:
     """Excitation that a recording needs for the laws of a family to be visible."""
     texts = {law.excitation: None for law in CATALOGUE.values() if law.family == family}
     return "; ".join(texts) or "–"
-
-
-def capital(text: str) -> str:
-    """The text with a capital first letter."""
-    return text[:1].upper() + text[1:]

@@ -5,7 +5,9 @@ from typing import NamedTuple, cast
 
 from rig.bridge.values import Mode
 from rig.log.reader import ConfigEntry
+from rig.pages.mode_band import last_entry, time_s
 from rig.pages.mode_words import MEANINGS, TONES, LoggedEvent, describe_cause
+from rig.pages.number_formats import capital
 
 _ENDS = {
     "done": ("good", "✓", "ENDED"),
@@ -59,19 +61,19 @@ def make_banner(
     folder, words = state
     if folder != "live":
         tone, sign, word = _ENDS.get(folder, ("idle", "…", folder.upper()))
-        last = _entry(events, Mode.SAFE) if folder == "safe" else None
+        last = last_entry(events, Mode.SAFE) if folder == "safe" else None
         cause = describe_cause(last) if last else ""
-        return Banner(tone, sign, word, f"{words} {_capital(cause)}." if cause else words)
+        return Banner(tone, sign, word, f"{words} {capital(cause)}." if cause else words)
     if newest is None:
         return Banner("idle", "…", "STARTING", "The model is being loaded.")
     mode, now_s = newest
     tone, sign = TONES[mode]
-    entry = _entry(events, mode)
+    entry = last_entry(events, mode)
     if mode is Mode.WAITING:
-        waited = "" if entry is None else f", {now_s - _time_s(entry):.0f} s"
+        waited = "" if entry is None else f", {now_s - time_s(entry):.0f} s"
         text = f"for {name_awaited(config)}{waited}. {MEANINGS[mode]}"
         return Banner(tone, sign, mode.name, text)
-    since = "" if entry is None else f"since {_time_s(entry):.1f} s"
+    since = "" if entry is None else f"since {time_s(entry):.1f} s"
     with_strut = len(config.get("observers", {})) > 1
     cause = ""
     if entry is not None and mode is not Mode.RUNNING:
@@ -89,16 +91,3 @@ def name_awaited(config: ConfigEntry) -> str:
     names = dict.fromkeys(str(entry.get("message")) for entry in heights.values())
     bus = config.get("bus", {})
     return f"{' and '.join(names) or 'a height'} on {bus.get('channel', 'the bus')}"
-
-
-def _entry(events: Sequence[LoggedEvent], mode: Mode) -> LoggedEvent | None:
-    """The event that entered a mode last."""
-    return next((it for it in reversed(events) if it.get("to") == mode.name), None)
-
-
-def _time_s(event: LoggedEvent) -> float:
-    return float(str(event["t_s"]))
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -4,10 +4,10 @@
 const Glance = (() => {
   const by = (id) => document.getElementById(id);
   const TILES = {
-    "tile-height": { plot: "height", column: "measured_height_m", colour: "--measured", limits: ["measured_height_m", "height_m"], decimals: { mm: 2, in: 4 } },
-    "tile-force": { plot: "force", column: "force_n", colour: "--estimated", limits: ["force_n"], decimals: { N: 1, lbf: 2 } },
-    "tile-innovation": { plot: "innovation", column: "innovation_m", colour: "--error", limits: ["innovation_m"], decimals: { mm: 3, in: 5 } },
-    "tile-force-error": { plot: "force-error", column: "force_error_n", colour: "--error", limits: ["force_difference_n"], decimals: { N: 1, lbf: 2 } },
+    "tile-height": { plot: "height", column: "measured_height_m", colour: "--measured", decimals: { mm: 2, in: 4 } },
+    "tile-force": { plot: "force", column: "force_n", colour: "--estimated", decimals: { N: 1, lbf: 2 } },
+    "tile-innovation": { plot: "innovation", column: "innovation_m", colour: "--error", decimals: { mm: 3, in: 5 } },
+    "tile-force-error": { plot: "force-error", column: "force_error_n", colour: "--error", decimals: { N: 1, lbf: 2 } },
   };
   const sparks = {};
 
@@ -41,7 +41,7 @@ const Glance = (() => {
     for (const [id, tile] of Object.entries(TILES)) {
       sparks[id]?.destroy();
       const [factor, unit] = unitOf(plots[tile.plot].unit);
-      const limits = limitsOf(tile.limits).map((value) => value * factor);
+      const limits = limitsOf(tile.plot).map((value) => value * factor);
       sparks[id] = Charts.spark(by(id).querySelector(".spark"), { colour: tile.colour, limits, leastSpan: factor * plots[tile.plot].least_span });
       Object.assign(tile, { factor, unit, shown: limits });
     }

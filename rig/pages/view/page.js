@@ -177,7 +177,7 @@ function build() {
     xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "ticks", logX: true, logY: true,
     series: ticks.curves.map((label, i) => ({ label, colour: ["--virtual", "--estimated"][i], paths: Charts.steps })),
   });
-  Glance.build(TABLE.plots, limitsOf, unitOf);
+  Glance.build(TABLE.plots, (plot) => limitsOf(LIMITED[plot]), unitOf);
 }
 
 const LIMITED = { height: ["measured_height_m", "height_m"], force: ["force_n"], innovation: ["innovation_m"], "force-error": ["force_difference_n"], virtual: ["virtual_force_n"] };
@@ -286,17 +286,19 @@ function events(found) {
   at("events").dataset.asked = asked;
   at("events").replaceChildren(...items.map((event) => {
     const entry = document.createElement("li");
-    const text = `${event.t_s.toFixed(3)} s  ${named(event.run, event.what)}${event.why ? `: ${event.why}` : ""}`;
-    const button = Object.assign(document.createElement("button"), { textContent: text });
-    button.addEventListener("click", () => showEvent(event.t_s, text));
+    const button = Object.assign(document.createElement("button"), { textContent: eventText(event) });
+    button.addEventListener("click", () => showEvent(event));
     entry.append(button);
     return entry;
   }));
   at("events").events = items;
 }
 
-function showEvent(t_s, text) {
-  at("event").textContent = text;
+const eventText = ({ t_s, run, what, why }) => `${t_s.toFixed(3)} s  ${named(run, what)}${why ? `: ${why}` : ""}`;
+
+function showEvent(event) {
+  const { t_s } = event;
+  at("event").textContent = eventText(event);
   look(Math.max(0, t_s - 0.5), t_s + 0.5);
 }
 
@@ -306,7 +308,7 @@ at("band").addEventListener("click", (event) => {
   if (!chart) return;
   const x = event.clientX - chart.over.getBoundingClientRect().left;
   const near = [...(at("events").events ?? [])].map((item) => [Math.abs(chart.valToPos(item.t_s, "x") - x), item]).sort((a, b) => a[0] - b[0])[0];
-  if (near && near[0] < 8) showEvent(near[1].t_s, `${near[1].t_s.toFixed(3)} s  ${near[1].what}${near[1].why ? `: ${near[1].why}` : ""}`);
+  if (near && near[0] < 8) showEvent(near[1]);
 });
 
 // --- Further charts, export, second cursor, link --------------------------------------------------
