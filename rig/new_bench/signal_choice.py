@@ -42,7 +42,7 @@ def choose_signals(
         database: The DBC.
         given: Signals that are named; the others are ranked.
         ask: Asks where a force of a name acts (None: at neither place), where neither name nor
-            comment shows it; None if nobody can be asked.
+            comment shows it; None where there is no terminal.
         is_dyno: Whether the bench prescribes the motion, which requires a load cell.
 
     Raises:
@@ -90,9 +90,8 @@ def choose_signals(
     return Signals(found, chosen, temperature, tuple(unclear), unknown)
 
 
-_MOST_LISTED = 6
-_LONGEST_COMMENT = 50
-"""Forces that a message lists, and characters of their comments."""
+_MOST_LISTED, _LONGEST_COMMENT = 6, 50
+"""Forces that a message lists, and characters of their comments: a message of about six lines."""
 
 
 def _ask_for_place(unclear: Sequence[RankedSignal]) -> str:
