@@ -53,7 +53,7 @@ class Statement(NamedTuple):
     text: str
 
 
-class Finding(NamedTuple):
+class FirstScreen(NamedTuple):
     """What the first screen states.
 
     Attributes:
@@ -71,10 +71,10 @@ class Finding(NamedTuple):
     certainty: tuple[Statement, ...]
 
 
-def find(result: Result) -> Finding:
+def find(result: Result) -> FirstScreen:
     """The first screen of a result."""
     diagnosis = result.diagnosis
-    return Finding(
+    return FirstScreen(
         _headline(diagnosis),
         _values(diagnosis),
         tuple(text for item in missing(diagnosis) if (text := _meaning(result, item))),
