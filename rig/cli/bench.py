@@ -168,4 +168,4 @@ def _run_with_bridge(
             plan, bench_config, out, RunControl(stop=stop, watch=watch), lockstep=True
         )
         keep_summary(ended, out)
-    print_end(plan, ended, out, diagnosis_of(plan, out), with_timing=False, as_json=as_json)
+    print_end(plan, ended, out, diagnosis_of(plan, out, model), with_timing=False, as_json=as_json)

@@ -51,6 +51,11 @@ def diagnose(
         find_browser()  # before a search that takes minutes, not after it
     refuse_existing(junit, option=JUNIT)
     spec = load_named_model(model, Path())
+    if not as_json:
+        print_text(
+            "Searching for what the model lacks: up to twenty minutes for a minute of recordings. "
+            "Ctrl-C ends the search; nothing is written then."
+        )
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
         write_report(result, out / REPORT_FILE)

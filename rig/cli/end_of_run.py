@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,11 +74,17 @@ def print_end(
         )
 
 
-def diagnosis_of(plan: "Plan", folder: Path) -> str:
-    """The command that diagnoses a run; empty where no force was measured."""
+def diagnosis_of(plan: "Plan", folder: Path, model: str | None = None) -> str:
+    """The command that diagnoses a run, with the model that it used; empty without a force."""
     if not plan.has_force:
         return ""
-    return f"rig diagnose {folder} --model {folder}/model.yaml --out diagnosis"
+    return f"rig diagnose {folder} --model {model or _model_of(plan)} --out found"
+
+
+def _model_of(plan: "Plan") -> str:
+    """The configuration's model: its name, or its file as seen from the current folder."""
+    file = plan.source.parent / plan.config.model
+    return os.path.relpath(file) if file.is_file() else plan.config.model
 
 
 def _print_validity(ended: "Ended") -> None:

@@ -40,7 +40,7 @@ def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
     console.print(styled(diagnosis.verdict.replace("_", " "), "bold"), end=": ")
     print_text(sentence(diagnosis, struts))
     _print_linear(diagnosis, struts=struts)
-    _print_effects(diagnosis)
+    _print_effects(diagnosis, struts=struts)
     _print_held_out(diagnosis)
     for note in diagnosis.notes:
         print_text(f"- {note}")
@@ -68,17 +68,18 @@ def _print_linear(diagnosis: "Diagnosis", *, struts: int) -> None:
         print_table(heads, rows, title)
 
 
-def _print_effects(diagnosis: "Diagnosis") -> None:
+def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
     from rig.pages.report.tables import effects, existing
+    from rig.pages.report.words import missing
 
-    missing, changed = effects(diagnosis), existing(diagnosis)
-    if missing:
-        rows = [
-            (f"{law.family}: {law.name}", key, value, interval)
-            for law, _, parameters in missing
-            for *_, value, interval, _, key in parameters
-        ]
-        print_table(("effect", "parameter", "value", "95 % interval"), rows, "Missing effects")
+    laws, changed = effects(diagnosis), existing(diagnosis)
+    if laws:
+        rows: list[tuple[str | Text, str, str]] = []
+        for found, (law, _, parameters) in zip(missing(diagnosis), laws, strict=True):
+            name = f"{law.name} ({found.strut})" if struts > 1 else law.name
+            rows.append((styled(name, "bold"), "", ""))
+            rows += [(f"  {row[0]}", row[2], row[3]) for row in parameters]
+        print_table(("effect", "value", "95 % interval"), rows, "Missing effects")
     for law, note, parameters in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in parameters]
         print_text(f"- {law.name}, {'; '.join((note, *values))}")

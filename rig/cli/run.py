@@ -109,7 +109,7 @@ def _run_one(
         )
         # Inside: a second Ctrl-C must not lose it.
         keep_summary(ended, folder)
-    following = diagnosis_of(plan, folder)
+    following = diagnosis_of(plan, folder, model)
     if listen_only:
         other, name = ("", "tuned") if model is None else (f" --model {model}", "tuned-corrected")
         following = f"rig tune {config}{other} --run {folder} --out {config.with_name(name)}.yaml"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
-from dart_model.spec import ModelSpec
+from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
     Diagnosis,
     Estimate,
@@ -127,7 +127,7 @@ def compose_result(
             is_white(problem, chosen, criteria.white),
         ),
         _notes(problem, search, by_blocks=by_blocks)
-        + _notes_of_springs(problem, chosen, corrected)
+        + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
         + _notes_of_friction_like_laws(problem, chosen, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
@@ -418,29 +418,6 @@ def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
                 "describe the strut?"
             )
     return notes
-
-
-def _notes_of_springs(problem: Problem, result: Fit, corrected: ModelSpec) -> tuple[str, ...]:
-    """How the corrected model file states a stiffness that was corrected about mid-stroke."""
-    notes: list[str] = []
-    for parameter, change in zip(problem.linear, result.parts.linear, strict=True):
-        before, after = problem.spec.struts[parameter.strut], corrected.struts[parameter.strut]
-        if parameter.kind != "stiffness" or change == 0.0 or after.stiffness_n_per_m == 0.0:
-            continue
-        constant_n = sum(
-            sign * item.parameters["force_n"]
-            for sign, strut in ((1.0, after), (-1.0, before))
-            for item in strut.effects
-            if item.name == "preload"
-        )
-        length_m = after.free_length_m + constant_n / after.stiffness_n_per_m
-        notes.append(
-            f"The stiffness of strut {before.name} is corrected about "
-            f"{mid_stroke_m(problem.motions[parameter.strut]):.4g} m. The corrected model states "
-            f"this as the new stiffness and {constant_n:+.3g} N of preload, which together are a "
-            f"linear spring of the free length {length_m:.4g} m."
-        )
-    return tuple(notes)
 
 
 def _notes_of_friction_like_laws(

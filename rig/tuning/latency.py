@@ -2,10 +2,11 @@
 
 The applied force arrives at once and the height late: compared with a model without the delay, the
 strut's force seems to depend on the applied force. With the right delay it is a function of height
-and of velocity, as far as the strut is one. So the run is computed again with a delay, the
-estimated force is smoothed, and fitted with functions of height and velocity and with its own
-derivative by the delay: the part of that derivative that the functions cannot represent determines
-the error of the delay and its variance. This is repeated until it converges (Gauss and Newton).
+and of velocity with dry friction, as far as the strut is one. So the run is computed again with a
+delay, the estimated force is smoothed, and fitted with functions of height and velocity and with
+its own derivative by the delay: the part of that derivative that the functions cannot represent
+determines the error of the delay and its variance. This is repeated until it converges (Gauss and
+Newton).
 
 A bench moved by a single sine does not determine the delay: whatever is periodic is a function of
 height and velocity there. Neither does a run that the observer follows for too short a time. The
@@ -27,6 +28,11 @@ from rig.tuning.expectation import FEWEST, Array, longest_stretch, residual_forc
 
 _DEGREE = 7
 """Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
+
+_FRICTION_OF_STROKE = (1e-3, 1e-2, 5e-2)
+"""Displacements over which dry friction reverses, as shares of the stroke: presliding of tens of
+micrometres to a soft seal. Without friction among the functions, its hysteresis is taken for a
+delay of the applied force."""
 
 _ITERATIONS = 6
 """Of Gauss and Newton: three sines took three, a single sine none that helps."""
@@ -165,11 +171,24 @@ def _delay_step(here: _Series, later: _Series) -> tuple[float, float]:
 
 
 def _functions(height: Array, velocity: Array) -> Array:
-    """Polynomials of height and of velocity, a product and absolute velocity: (N, functions)."""
-    z = 2.0 * (height - height.mean()) / max(float(np.ptp(height)), 1e-12)
+    """Functions (N, functions) of height, velocity and direction: polynomials and dry friction."""
+    stroke_m = max(float(np.ptp(height)), 1e-12)
+    z = 2.0 * (height - height.mean()) / stroke_m
     v = velocity / max(float(np.abs(velocity).max()), 1e-12)
     powers = [item**power for item in (z, v) for power in range(1, _DEGREE + 1)]
-    return np.column_stack([np.ones_like(z), *powers, np.abs(v), np.abs(v) * v, z * v])
+    friction = [_friction(height, share * stroke_m) for share in _FRICTION_OF_STROKE]
+    return np.column_stack([np.ones_like(z), *powers, np.abs(v), np.abs(v) * v, z * v, *friction])
+
+
+def _friction(height_m: Array, reversal_m: float) -> Array:
+    """Dry friction of unit size along heights, shape (N,), after Dahl (1968)."""
+    change = np.diff(height_m)
+    kept = np.exp(-np.abs(change) / reversal_m)
+    gained = np.sign(change) * (1.0 - kept)
+    force = [0.0]
+    for keep, gain in zip(kept.tolist(), gained.tolist(), strict=True):
+        force.append(keep * force[-1] + gain)
+    return np.array(force)
 
 
 def _long_run_variance(values: Array) -> float:

@@ -31,7 +31,7 @@ NOISE_M = 20e-6
 SINES = ((60.0, 8.0), (50.0, 19.3), (40.0, 37.7))
 
 
-def bench(folder, latency_ns=0, sines=SINES, force_latency_ns=0):
+def bench(folder, latency_ns=0, sines=SINES, force_latency_ns=0, effects=()):
     """A run of 8 s, from a bench with a noisy height of coarse steps that comes late."""
     dbc = DEFAULT_DATABASE.read_text("utf-8")
     fine = "SG_ HEIGHT : 12|20@1- (2E-006,0) [-1.048576|1.048574]"
@@ -51,6 +51,7 @@ def bench(folder, latency_ns=0, sines=SINES, force_latency_ns=0):
     content["applied_force"]["components"] = [
         {"kind": "sine", "amplitude_n": n, "angular_frequency_rad_per_s": w} for n, w in sines
     ]
+    content["undeclared_effects"] = list(effects)
     (folder / "bench.yaml").write_text(yaml.safe_dump(content))
     config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
     del config["timing"]
@@ -114,6 +115,15 @@ def test_an_applied_force_that_arrives_late_is_reported(tmp_path, capsys, monkey
     shown = " ".join(capsys.readouterr().out.split())
     assert "The applied force arrives" in shown
     assert "ms later than the height" in shown
+
+
+def test_dry_friction_is_not_taken_for_a_delay_of_the_applied_force(tmp_path):
+    """Its hysteresis depends on the displacement, as the rate of the force seems to."""
+    parameters = {"coulomb_force_n": 12.0, "presliding_m": 2e-4}
+    law = {"name": "friction", "strut": "strut", "parameters": parameters}
+    _, found = tuned(bench(tmp_path, effects=[law]))
+    assert found.latency.low_s < 0.0 < found.latency.high_s
+    assert found.latency.std_s < 0.05e-3
 
 
 def test_another_model_is_tuned_with_the_frames_of_a_run(late):

@@ -41,7 +41,7 @@ _DIRECTIONS = {
     "damping_n_s_per_m": ("Damping", "larger", "smaller"),
     "preload_n": ("Preload", "larger", "smaller"),
     "input_gain": ("Applied force", "larger", "smaller"),
-    "free_length_m": ("Free length", "longer", "shorter"),
+    "free_length_m": ("Centre of the spring law", "higher", "lower"),
 }
 
 

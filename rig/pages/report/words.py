@@ -21,7 +21,7 @@ LINEAR = {
     "damping_n_s_per_m": ("damping", "N·s/m"),
     "preload_n": ("preload", "N"),
     "input_gain": ("input gain", ""),
-    "free_length_m": ("free length", "m"),
+    "free_length_m": ("centre of the spring law", "m"),
 }
 """Name and unit of each parameter that a linear correction may change."""
 
