@@ -62,6 +62,9 @@ _HOLD = 0.3
 _FAR = 3.0
 """Standard deviations from a stated value that one in 370 corrections exceeds by chance."""
 
+_AT_BOUND = 1e-3
+"""Distance from the end of a range, relative, within which a parameter counts as at it."""
+
 _FRICTION_LIKE = 0.2
 """Share of a damper law's RMS that differs from dry friction, below which it acts as that."""
 
@@ -128,6 +131,7 @@ def compose_result(
         ),
         _notes(problem, search, by_blocks=by_blocks)
         + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
+        + _notes_of_bounds(problem, estimates)
         + _notes_of_friction_like_laws(problem, chosen, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
@@ -418,6 +422,30 @@ def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
                 "describe the strut?"
             )
     return notes
+
+
+def _notes_of_bounds(problem: Problem, estimates: FitEstimates) -> tuple[str, ...]:
+    """Parameters of laws at the end of the range in which they are searched, other than zero."""
+    fit, space = estimates.fit, estimates.fit.space
+    names = [problem.existing[index].name for index in fit.candidate.kept]
+    names += [name for _, name in fit.candidate.new]
+    notes: list[str] = []
+    for row, variables in effect_variables(problem, fit).items():
+        law = effect(names[row])
+        for variable, parameter in zip(variables.tolist(), law.parameters, strict=True):
+            low, high = float(space.low[variable]), float(space.high[variable])
+            value = float(fit.solution.values[variable])
+            near = _AT_BOUND * (abs(value) if low > 0.0 else float(space.scale[variable]))
+            ends = {low: "lower", high: "upper"} if low < high else {}
+            at = [end for bound, end in ends.items() if bound and abs(value - bound) <= near]
+            if at and estimates.estimate(variable).low is not None:
+                text = f"{value:.3g} {parameter.unit}".rstrip()
+                notes.append(
+                    f"{parameter.name} of {law.name} is at the {at[0]} end of its range "
+                    f"({text}): the data may require a value beyond it, and "
+                    "its interval is not to be relied on."
+                )
+    return tuple(notes)
 
 
 def _notes_of_friction_like_laws(

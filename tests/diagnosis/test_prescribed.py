@@ -164,6 +164,26 @@ def test_the_corrected_model_lacks_nothing():
     assert again.verdict == "nothing_missing"
 
 
+class SteepStop(Nothing):
+    """Grows with a power of 6: the laws of stops end at 4."""
+
+    def force(self, t, z, v, state, warm):
+        return 900.0 * (max(0.29 - z, 0.0) / 0.02) ** 6.0
+
+
+def test_a_parameter_at_the_end_of_its_range_is_noted():
+    parameters = (
+        "{contact_height_m: 0.28, force_at_10_mm_n: 300.0, exponent: 3.5, dissipation_s_per_m: 0}"
+    )
+    model = dyno.model(effects=f"[{{name: power_bump_stop, parameters: {parameters}}}]")
+    runs = [dyno.run(SteepStop()), dyno.run(SteepStop(), seed=2)]
+    notes = diagnose(model, runs[:1], runs[1:]).diagnosis.notes
+    assert any(
+        "exponent of power_bump_stop is at the upper end of its range (4" in n for n in notes
+    )
+    assert not any("lower end" in note for note in notes)
+
+
 class FrictionAndHardening(Nothing):
     def force(self, t, z, v, state, warm):
         friction = -60.0 * v / math.sqrt(v * v + 4e-6)
