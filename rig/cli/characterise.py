@@ -11,6 +11,8 @@ from rig.cli.junit import JUNIT, JUnitFile, Outcome, write_junit
 from rig.cli.terminal import (
     FAILED,
     JsonFlag,
+    Labels,
+    PrintToo,
     StrutOfRun,
     print_json,
     print_table,
@@ -68,6 +70,8 @@ def characterise_command(
     serial: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Serial number, for the report.")
     ] = None,
+    label: Labels = None,
+    pdf: PrintToo = False,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
@@ -80,9 +84,13 @@ def characterise_command(
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
+    from rig.pages.identity import parse_labels
 
     if out is not None:
         refuse_full(out)
+    if pdf:
+        _require_printing(out)
+    labels = ({"serial": serial} if serial else {}) | parse_labels(label or [])
     refuse_existing(junit, option=JUNIT)
     if junit is not None and tolerance is None and master is None:
         raise InputError("--junit: expected --tolerance or --master, which it reports on")
@@ -90,10 +98,8 @@ def characterise_command(
     reports = evaluate_records(runs, strut, band, master, scatter)
     content = content_of(reports, serial, band)
     if out is not None:
-        from rig.pages.characteristics_page import write_characteristics_page
-
         write_content(content, out)
-        write_characteristics_page(reports, out / "report.html", serial)
+        _write_sheet(reports, out, labels, pdf=pdf)
     checks = [check for report in reports for check in report.checks()]
     outcomes = [Outcome(check.name, check.words, not check.passes) for check in checks]
     write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
@@ -103,9 +109,30 @@ def characterise_command(
         for report in reports:
             _print(report)
         if out is not None:
-            print_text(f"Report: {out / 'report.html'}")
+            print_text(f"Report: {out / 'report.html'}{' and report.pdf' if pdf else ''}")
     if not all(check.passes for check in checks):
         raise typer.Exit(FAILED)
+
+
+def _require_printing(out: Path | None) -> None:
+    """Refuse printing without a folder or a browser, before the work."""
+    from rig.pages.browser_print import find_browser
+
+    if out is None:
+        raise InputError("--pdf: expected --out DIR, where the report is written")
+    find_browser()
+
+
+def _write_sheet(
+    reports: "Sequence[DamperReport]", out: Path, labels: dict[str, str], *, pdf: bool
+) -> None:
+    from rig.pages.browser_print import print_page
+    from rig.pages.characteristics_page import write_characteristics_page
+
+    page = out / "report.html"
+    write_characteristics_page(reports, page, labels)
+    if pdf:
+        print_page(page, page.with_suffix(".pdf"))
 
 
 def _print(report: "DamperReport") -> None:

@@ -1,20 +1,20 @@
 """`rig compare`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import JsonFlag, StrutOfRun, console, print_json, print_table, print_text
+from rig.cli.terminal import JsonFlag, Labels, StrutOfRun, print_json, print_table, print_text
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics
-    from rig.dyno.comparison import Difference, Trend
-    from rig.dyno.stroke_force import Figure
+    from rig.pages.comparison_page import ComparisonTable
 
 EXAMPLES = (
-    "Examples: `rig compare before.csv after.csv` · "
+    "Examples: `rig compare before.csv after.csv --out compared` · "
     "`rig compare 2bar.csv 4bar.csv 6bar.csv --dose 2 --dose 4 --dose 6`"
 )
 
@@ -32,6 +32,11 @@ def compare_command(
         ),
     ] = None,
     strut: StrutOfRun = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="New folder for comparison.json and report.html."),
+    ] = None,
+    label: Labels = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Compare two states of a damper: list the figures that differ significantly, and the others.
@@ -41,73 +46,73 @@ def compare_command(
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, trends_over_dose
+    from rig.files.folders import refuse_full
+    from rig.pages.comparison_page import (
+        difference_tables,
+        summarise_differences,
+        summarise_trends,
+        trend_tables,
+    )
+    from rig.pages.identity import parse_labels
 
     if not dose and len(runs) != 2:
         raise InputError(
             f"{len(runs)} given, expected two records to compare, or --dose NUMBER once for each"
         )
+    if out is not None:
+        refuse_full(out)
+    labels = parse_labels(label or [])
     records = [characterise(path, strut) for path in runs]
     if dose:
         trends = trends_over_dose(records, dose)
-        if as_json:
-            print_json({"schema": 1, "trends": trends})
-        else:
-            _print_trends(trends)
-            _print_missing(records)
-        return
-    differences = compare_dampers(records[0], records[1])
+        content = {"schema": 1, "trends": trends}
+        summary, tables = summarise_trends(trends, records), trend_tables(trends)
+    else:
+        differences = compare_dampers(*records)
+        content = {"schema": 1, "differences": differences}
+        summary = summarise_differences(differences, records)
+        tables = difference_tables(differences, *(record.name for record in records))
+    if out is not None:
+        _write(records, summary, tables, content, out, labels)
     if as_json:
-        print_json({"schema": 1, "differences": differences})
+        print_json(content)
         return
-    _print_differences(differences, records[0].name, records[1].name)
-    _print_missing(records)
+    _print(records, summary, tables)
+    if out is not None:
+        print_text(f"Report: {out / 'report.html'}")
 
 
-def _print_missing(records: "list[Characteristics]") -> None:
+def _write(
+    records: "Sequence[Characteristics]",
+    summary: str,
+    tables: "Sequence[ComparisonTable]",
+    content: object,
+    out: Path,
+    labels: dict[str, str],
+) -> None:
+    from rig.dyno.report import write_content
+    from rig.pages.comparison_page import write_comparison_page
+
+    write_content(content, out, "comparison.json")
+    write_comparison_page(records, summary, tables, out / "report.html", labels)
+
+
+def _print(
+    records: "Sequence[Characteristics]",
+    summary: str,
+    tables: "tuple[ComparisonTable, ComparisonTable]",
+) -> None:
     from rig.dyno.comparison import steps_without_partner
 
-    for text in steps_without_partner(records):
-        print_text(f"- not compared: {text}")
-
-
-def _print_differences(differences: "list[Difference]", before: str, after: str) -> None:
-    from rig.pages.characteristics_page import with_half
-
-    rows: list[tuple[str, ...]] = []
-    same: list[str] = []
-    for item in differences:
-        if item.differs:
-            states = with_half(item.before), with_half(item.after)
-            rows.append((item.figure, *states, _interval(item.change, item.unit)))
-        else:
-            bound = f"{max(abs(item.change.low), abs(item.change.high)):.2g} {item.unit}".rstrip()
-            same.append(f"{item.figure} (by at most {bound})")
-    if rows:
-        print_table(("figure", before, after, "change, 95 % interval"), rows, "What differs")
-    else:
-        console.print("No figure that was compared differs by more than chance.")
-    if same:
-        print_text(f"Not shown to differ: {'; '.join(same)}.")
-
-
-def _print_trends(trends: "list[Trend]") -> None:
-    rows = [
-        (
-            item.figure,
-            _interval(item.slope, item.unit),
-            f"{item.at_zero:.4g} {item.unit}",
-            "straight" if item.is_straight else "bent: no straight line",
+    print_text(f"{summary[:1].upper()}{summary[1:]}.")
+    changed, others = tables
+    if changed.rows:
+        rows = [(row.figure, *row.cells) for row in changed.rows]
+        print_table(changed.heads, rows, changed.title)
+    if others.rows:
+        texts = (
+            f"{row.figure} ({others.heads[-1].lower()} {row.cells[-1]})" for row in others.rows
         )
-        for item in trends
-        if item.differs
-    ]
-    if rows:
-        heads = ("figure", "change per unit of dose", "at zero", "")
-        print_table(heads, rows, "Over the dose")
-    same = [item.figure for item in trends if not item.differs]
-    if same:
-        print_text(f"No change over the dose: {'; '.join(same)}.")
-
-
-def _interval(figure: "Figure", unit: str) -> str:
-    return f"{figure.value:+.3g} {unit} ({figure.low:+.3g} to {figure.high:+.3g})"
+        print_text(f"{others.title}: {'; '.join(texts)}.")
+    for text in steps_without_partner(records):
+        print_text(f"- not comparable: {text}")

@@ -8,7 +8,7 @@ import typer
 from rig.cli.junit import JUNIT, JUnitFile, write_junit
 from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
-from rig.cli.terminal import JsonFlag, print_text, refuse_existing
+from rig.cli.terminal import JsonFlag, Labels, PrintToo, print_text, refuse_existing
 
 _FAR_LESS = 0.5
 """Share of the residual force from which on a corrected model is worth its corrections."""
@@ -31,12 +31,8 @@ def diagnose(
             "Without it, blocks of RUN are held out.",
         ),
     ] = None,
-    pdf: Annotated[
-        bool,
-        typer.Option(
-            "--pdf", help="Also write the report as PDF; requires Chromium, Chrome or Edge."
-        ),
-    ] = False,
+    label: Labels = None,
+    pdf: PrintToo = False,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
@@ -45,11 +41,13 @@ def diagnose(
     from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json
     from rig.pages.browser_print import find_browser, print_page
+    from rig.pages.identity import parse_labels
     from rig.pages.report import write_report
 
     if pdf:
         find_browser()  # before a search that takes minutes, not after it
     refuse_existing(junit, option=JUNIT)
+    labels = parse_labels(label or [])
     spec = load_named_model(model, Path())
     if not as_json:
         print_text(
@@ -58,7 +56,7 @@ def diagnose(
         )
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
-        write_report(result, out / REPORT_FILE)
+        write_report(result, out / REPORT_FILE, labels)
         if pdf:
             print_page(out / REPORT_FILE, out / "report.pdf")
     write_junit(junit, f"rig diagnose {spec.name}", diagnosis_check(result.diagnosis, spec))

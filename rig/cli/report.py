@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import JsonFlag, RunFolder, print_json, print_text
+from rig.cli.terminal import JsonFlag, Labels, PrintToo, RunFolder, print_json, print_text
 
 EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
 
@@ -17,17 +17,14 @@ def report(
         Path | None,
         typer.Option(metavar="FILE", help="New HTML file; RUN/report.html by default."),
     ] = None,
-    pdf: Annotated[
-        bool,
-        typer.Option(
-            "--pdf", help="Also write the report as PDF; requires Chromium, Chrome or Edge."
-        ),
-    ] = False,
+    label: Labels = None,
+    pdf: PrintToo = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a report of a run as one HTML file: configuration, errors, timing, faults."""
     from rig.log.checksums import refuse_damage
     from rig.pages.browser_print import print_page
+    from rig.pages.identity import parse_labels
     from rig.pages.run_report import write_run_report
 
     path = out or run / "report.html"
@@ -37,7 +34,7 @@ def report(
     for existing in (path, paper) if pdf else (path,):
         if existing.exists():
             raise InputError(f"{existing}: exists, expected another name (--out)")
-    damage = write_run_report(run, path)
+    damage = write_run_report(run, path, parse_labels(label or []))
     if pdf:
         print_page(path, paper)
     if as_json:

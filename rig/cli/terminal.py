@@ -32,6 +32,19 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.
 StrutOfRun = Annotated[
     str | None, typer.Option(metavar="NAME", help="Strut of the run, if there are several.")
 ]
+Labels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--label",
+        metavar="NAME=TEXT",
+        help="Row of the report's head, such as damper, serial, date, operator, bench; may be "
+        "repeated. A usual row that is missing is a line to fill in on paper.",
+    ),
+]
+PrintToo = Annotated[
+    bool,
+    typer.Option("--pdf", help="Also write the report as PDF; requires Chromium, Chrome or Edge."),
+]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON only.")]
 Interface = Annotated[str, typer.Option(metavar="NAME", help="python-can's name of the interface.")]
 Channel = Annotated[str, typer.Option(metavar="NAME", help="Channel of the interface.")]

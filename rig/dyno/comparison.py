@@ -175,14 +175,7 @@ def _figures_by_name(
     item: Characteristics, reference: Characteristics
 ) -> Mapping[str, tuple[str, Figure]]:
     """Figures by name; steps are called by their speed in the first record."""
-    damper = item.damper
-    figures: dict[str, tuple[str, Figure | None]] = {
-        "gas force": ("N", damper.gas_force_n),
-        "gas spring rate": ("N/m", damper.gas_rate_n_per_m),
-        "friction": ("N", damper.friction_n),
-        "rebound over compression": ("", damper.asymmetry),
-        **{f"knee, {side}": ("m/s", figure) for side, figure in damper.knee_m_per_s.items()},
-    }
+    figures: dict[str, tuple[str, Figure | None]] = {**item.damper.properties()}
     for sought, step in pair_steps(reference, item):
         if step is None:
             continue

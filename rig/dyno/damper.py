@@ -53,6 +53,17 @@ class Damper(NamedTuple):
     force_per_kelvin_n_per_k: dict[str, Figure | None]
     notes: tuple[str, ...]
 
+    def properties(self) -> dict[str, tuple[str, Figure]]:
+        """Unit and figure of each property of the damper that the test determines, by name."""
+        named = {
+            "gas force": ("N", self.gas_force_n),
+            "gas spring rate": ("N/m", self.gas_rate_n_per_m),
+            "friction": ("N", self.friction_n),
+            **{f"knee, {side}": ("m/s", figure) for side, figure in self.knee_m_per_s.items()},
+            "rebound over compression": ("", self.asymmetry),
+        }
+        return {name: (unit, it) for name, (unit, it) in named.items() if it is not None}
+
 
 def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper from its steps, in time; one at least."""

@@ -11,6 +11,7 @@ best size of each fault is found, and what it lowers the chi-squared by is held 
 `_NAMED` (Wilks, Ann. Math. Stat. 9, 1938).
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -82,6 +83,21 @@ class Fault(NamedTuple):
     most: float = np.inf
 
 
+_PHRASES = {
+    "relative loss": ("{name} {size} lost", "{name} {size} too high"),
+    "increase": ("{name} {size} higher", "{name} {size} lower"),
+    "compliance of the oil": ("{name}, which gives way by {size}", ""),
+    "width": ("{name} of {size}", ""),
+    "relative reduction of the opening speed": ("{name}, at a speed {size} lower", ""),
+    "relative change at all speeds": ("{name}: {size} higher", "{name}: {size} lower"),
+}
+"""Words for a positive and a negative size of each quantity."""
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
 class NamedFault(NamedTuple):
     """A fault with its size, a 95 % interval, and the decrease of chi-squared that it explains."""
 
@@ -92,14 +108,18 @@ class NamedFault(NamedTuple):
     evidence: float
 
     def words(self) -> str:
-        """The same in a line."""
-        size, unit = self.size, f" {self.unit}" if self.unit else ""
-        least = "at least " if np.isinf(size.high) else "at most " if np.isinf(size.low) else ""
-        interval = f"({size.low:.3g} to {size.high:.3g})"
-        return (
-            f"{self.name}: {self.quantity} {least}{size.value:.3g}{unit} "
-            f"{'' if least else interval}".rstrip()
+        """The same in a line, such as “gas pressure 52 % lost (95 %: 40 to 65 %)”."""
+        size, unit = self.size, self.unit or "%"
+        more, less = _PHRASES[self.quantity]
+        is_less = size.value < 0.0
+        scale = (-1.0 if is_less else 1.0) * (1.0 if self.unit else 100.0)
+        low, value, high = sorted(scale * end for end in (size.low, size.value, size.high))
+        bound = "at least " if math.isinf(high) else "at most " if math.isinf(low) else ""
+        words = (less if is_less else more).format(
+            name=self.name, size=f"{bound}{_two_digits(value)} {unit}"
         )
+        interval = f" (95 %: {_two_digits(low)} to {_two_digits(high)} {unit})"
+        return words if bound else words + interval
 
 
 class MasterComparison(NamedTuple):
@@ -131,8 +151,8 @@ class MasterComparison(NamedTuple):
         elif not self.named:
             text = "not as its master, and no fault that is known explains it"
         else:
-            faults = "; ".join(item.words() for item in self.named)
-            text = f"{faults}: explains {100 * self.explained:.0f} % of what differs"
+            faults = " and ".join(item.words() for item in self.named)
+            text = f"{faults}; this explains {100 * self.explained:.0f} % of the difference"
         missing = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
         return text + missing
 

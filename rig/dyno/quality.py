@@ -5,7 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from rig.dyno.figures import AtRest, DynoStep, ForceRecord
+from rig.dyno.figures import SIDES, AtRest, DynoStep, ForceRecord
+from rig.dyno.stroke_force import FINE, MeanStroke
 from rig.dyno.strokes import Array
 from rig.recordings.clipping import find_sudden_plateaus
 
@@ -25,10 +26,21 @@ _COARSE = 2.0
 """Steps of a channel over its noise from which on the steps are what is seen."""
 
 
+_PARTS = 72
+"""Parts of a stroke whose samples' means are compared with the mean curve: 2.5 degrees each."""
+
+_LEFT = 0.1
+"""Share of a stroke's range of force by which a mean curve may leave its samples: good dampers stay
+below 0.06 (where friction reverses), free play of 0.5 mm leaves 0.2, a knock of 1 mm above 1."""
+
+_CERTAIN = 5.0
+"""Standard deviations of a part's mean that such a difference has at least."""
+
+
 def quality(
     record: ForceRecord, steps: Sequence[DynoStep], holds: Sequence[AtRest], strokes: int
 ) -> tuple[str, ...]:
-    """Warnings of gaps, few samples, a coarse force, a wrong sign, unused strokes, a drift at rest.
+    """Warnings of gaps, few samples, coarse steps, a wrong sign, unused strokes, drift, poor fits.
 
     `strokes` is the number of strokes of the record.
     """
@@ -40,6 +52,7 @@ def quality(
         *_few_samples(t_s, steps),
         *_coarse(force_n),
         *_drift(holds),
+        *_left_samples(steps),
     )
 
 
@@ -125,3 +138,34 @@ def _drift(holds: Sequence[AtRest]) -> Iterator[str]:
                 "cell that drifts"
             )
             return
+
+
+def _left_samples(steps: Sequence[DynoStep]) -> Iterator[str]:
+    """The place where a mean curve leaves its samples most, if it leaves any by much."""
+    worst_share, text = _LEFT, ""
+    for step in steps:
+        for side, stroke in zip(SIDES, step.strokes, strict=True):
+            apart_n, angle = _largest_distance(stroke)
+            share = abs(apart_n) / max(float(np.ptp(stroke.force_n)), 1e-300)
+            if share > worst_share:
+                worst_share = share
+                at_mm = 1e3 * stroke.sign * stroke.amplitude_m * np.sin(angle)
+                text = (
+                    f"the mean curve of {side} at {step.peak_speed_m_per_s:.3g} m/s leaves its "
+                    f"samples by {abs(apart_n):.3g} N at {at_mm:+.1f} mm from mid-stroke: a knock, "
+                    "free play or another force that changes within a short travel"
+                )
+    if text:
+        yield text
+
+
+def _largest_distance(stroke: MeanStroke) -> tuple[float, float]:
+    """Largest distance of the samples' means from the mean curve that is certain, and its angle."""
+    part = np.arange(len(FINE)) * _PARTS // len(FINE)
+    counts = np.bincount(part, stroke.samples, _PARTS)
+    curve_n = stroke.row(FINE) @ stroke.force_n
+    sums_n = np.bincount(part, stroke.sums_n - stroke.samples * curve_n, _PARTS)
+    means_n = sums_n / np.maximum(counts, 1.0)
+    is_certain = np.abs(means_n) * np.sqrt(counts) > _CERTAIN * stroke.noise_n
+    at = int(np.argmax(np.abs(means_n) * is_certain))
+    return float(means_n[at] * is_certain[at]), float(FINE[np.flatnonzero(part == at)].mean())

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
@@ -13,6 +13,8 @@ from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
 from rig.files.json_text import json_text
 
 CHARACTERISTICS_FILE = "characteristics.json"
+
+Standing = Literal["pass", "open", "fail"]
 
 
 class Check(NamedTuple):
@@ -29,6 +31,22 @@ class DamperReport(NamedTuple):
     characteristics: Characteristics
     points: Sequence[PointVerdict] = ()
     against_master: MasterComparison | None = None
+    master: Characteristics | None = None
+
+    @property
+    def standing(self) -> Standing | None:
+        """Verdict on the damper as a whole; None where it is held against nothing.
+
+        It fails with one point outside the band, or if it differs from its master; it passes if
+        every point and every step of the master's record does. Otherwise the record proves neither.
+        """
+        verdicts, comparison = {point.verdict for point in self.points}, self.against_master
+        if "fail" in verdicts or (comparison is not None and not comparison.is_good):
+            return "fail"
+        if not verdicts and comparison is None:
+            return None
+        is_proven = verdicts <= {"pass"} and (comparison is None or comparison.passes)
+        return "pass" if is_proven else "open"
 
     def checks(self) -> list[Check]:
         """Every criterion, point by point."""
@@ -71,12 +89,14 @@ def evaluate_records(
         InputError: A record cannot be characterised, or not be compared with the master.
     """
     records = [characterise(path, strut) for path in paths]
-    good = None if master is None else master_of(characterise(master, strut))
+    good = None if master is None else characterise(master, strut)
+    model = None if good is None else master_of(good)
     return [
         DamperReport(
             record,
             () if band is None else evaluate_band(record.steps, band),
-            None if good is None else name_faults(record, good, scatter),
+            None if model is None else name_faults(record, model, scatter),
+            good,
         )
         for record in records
     ]
@@ -94,14 +114,14 @@ def content_of(
     }
 
 
-def write_content(content: dict[str, object], folder: Path) -> None:
-    """Write `characteristics.json` into a folder, which is made if it is missing.
+def write_content(content: object, folder: Path, name: str = CHARACTERISTICS_FILE) -> None:
+    """Write a JSON file into a folder, which is made if it is missing.
 
     Raises:
         InputError: The folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / CHARACTERISTICS_FILE, json_text(content))
+        write_whole(folder / name, json_text(content))
     except OSError as error:
         raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error

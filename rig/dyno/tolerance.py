@@ -74,6 +74,13 @@ class PointVerdict(NamedTuple):
     high_n: float
     verdict: Verdict
 
+    @property
+    def margin_n(self) -> float | None:
+        """Distance of the force from the nearer limit, negative beyond it; None if unknown."""
+        if self.force is None:
+            return None
+        return min(self.force.value - self.low_n, self.high_n - self.force.value)
+
     def words(self) -> str:
         """The same in a line."""
         band = f"{self.low_n:g} to {self.high_n:g} N"

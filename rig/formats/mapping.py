@@ -91,7 +91,7 @@ class _Channel(_Section):
         column: Column of the quantity, by its name or its number (from 1).
         unit: Unit of gain times reading.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
-            sensitivity of the sensor.
+            reciprocal of the sensor's sensitivity, such as 100 for 10 mV/K.
     """
 
     column: ColumnName
@@ -116,7 +116,7 @@ class HeightChannel(_Channel):
     Attributes:
         unit: Unit of gain times reading, such as `mm`.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
-            sensitivity of the sensor, such as 20 for 20 mm/V.
+            reciprocal of the sensor's sensitivity, such as 20 for 0.05 V/mm.
         zero: A reading at a known length of the strut; if absent, the reading is the length.
         reversed: True if the reading falls while the strut gets longer; requires `zero`.
     """
@@ -143,7 +143,7 @@ class ForceChannel(_Channel):
     Attributes:
         unit: Unit of gain times reading, such as `kN` or `lbf`.
         gain: Factor on the reading, in `unit` per unit of the table. If volts were recorded: the
-            sensitivity of the sensor, such as 500 for 500 N/V.
+            reciprocal of the sensor's sensitivity, such as 500 for 2 mV/N.
         tare_n: Reading without a force, in N after the gain and the conversion of the unit and
             before a reversal.
         reversed: True if the table has the opposite sign.

@@ -81,6 +81,14 @@ def value_and_interval(estimate: Estimate, unit: str) -> tuple[str, str]:
     return with_unit(value, name), f"{low_text} to {with_unit(high_text, name)}"
 
 
+def plus_minus(value: float, half: float) -> str:
+    """A value and half its interval, both with the digits that the interval justifies."""
+    if not (math.isfinite(value) and math.isfinite(half) and half > 0.0):
+        return three_digits(value) if math.isfinite(value) else "–"
+    decimals = decimals_of(half)
+    return f"{number(value, decimals)}{_NO_BREAK}±{_NO_BREAK}{number(half, decimals)}"
+
+
 def ratio(value: float, reference: float) -> str:
     """Value over a reference; a dash where that has no meaning."""
     if not (reference > 0.0 and math.isfinite(value)):

@@ -1,7 +1,7 @@
 """The report of a run: configuration, timing, faults and curves. One file, no network."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from rig.log.checksums import Damage, find_damage, refuse_damage
 from rig.log.follower import FORCE_ERROR, RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
+from rig.pages.identity import identity_rows
 from rig.pages.mode_band import last_entry, list_events, make_band, read_events, time_s
 from rig.pages.mode_words import COUNT_WORDS, LoggedEvent, describe_cause
 from rig.pages.number_formats import number, percent, quantity
@@ -61,8 +62,12 @@ _CYCLES_AT_ONCE = 60_000
 _LOST_MODES = ("HOLD", "SAFE")
 
 
-def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
+def write_run_report(
+    folder: Path, path: Path, labels: Mapping[str, str] | None = None
+) -> tuple[Damage, ...]:
     """Write the report of a run's folder; returns what of the run is damaged.
+
+    `labels` are rows of the report's head, such as an operator's name.
 
     Raises:
         DamageError: Frames or steps are not what was written; what is merely cut off is reported.
@@ -84,6 +89,7 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
     text = render_report(
         "run.html",
         name=folder.resolve().name,
+        identity=identity_rows(labels or {}),
         changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in read_changes(folder)],
         tone=tone,
         sign=sign,

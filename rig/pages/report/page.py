@@ -1,6 +1,6 @@
 """The page of a diagnosis."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from dart_model.spec import dump_model
 from rig.diagnosis.outcome import Diagnosis, FittedSeries, Result
 from rig.machine.installed_versions import version_of
 from rig.pages.html import render_report, write_page
+from rig.pages.identity import identity_rows
 from rig.pages.number_formats import capital, percent
 from rig.pages.report import tables
 from rig.pages.report.figures import (
@@ -59,16 +60,18 @@ _PACKAGES = ("rig", "dartpy", "numpy", "scipy", "numba")
 _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only input.",)
 
 
-def write_report(result: Result, path: Path) -> None:
+def write_report(result: Result, path: Path, labels: Mapping[str, str] | None = None) -> None:
     """Write the page as one file that needs no network; a former one is replaced in one step.
+
+    `labels` are rows of the page's head, such as an operator's name.
 
     Raises:
         InputError: The file cannot be written.
     """
-    write_page(page(result), path)
+    write_page(page(result, labels), path)
 
 
-def page(result: Result) -> str:
+def page(result: Result, labels: Mapping[str, str] | None = None) -> str:
     """Text of the page, the same for the same input.
 
     Raises:
@@ -82,6 +85,7 @@ def page(result: Result) -> str:
     return render_report(
         "page.html",
         diagnosis=diagnosis,
+        identity=identity_rows(labels or {}),
         sentence=sentence(diagnosis, len(struts)),
         tone=tone,
         sign=sign,
