@@ -37,12 +37,12 @@ processes. The throughput is compared with that of plain loops, which diagnose o
 other: {CORES} such loops run simultaneously, one per core; together they diagnose {singles} runs,
 each once, after a first diagnosis in each loop that is not timed.
 
-The cost of distribution is the CPU time of the campaign's process, which distributes the runs and
-writes the store, plus that of Dask's scheduler. The overhead inside the workers is not counted. The
-runs are short: with longer runs, distribution costs a smaller share. The cost per run contains a
-share of the fixed cost of the campaign, which is larger with few runs. The cost for a million runs
-is a million times this cost per run; this is an upper estimate if the further cost of each run does
-not grow with the number of runs, which was not measured.
+The cost of distribution is the CPU time of the campaign's process, which distributes the runs
+and writes the store, plus that of Dask's scheduler. The overhead inside the workers is not
+counted. The runs are short: with longer runs, distribution costs a smaller share. The cost per
+run contains a share of the fixed cost of the campaign, which is larger with few runs. The cost
+for a million runs is a million times this cost per run; this is an upper estimate if the
+further cost of each run does not grow with the number of runs, which was not measured.
 
 The loops and the two campaigns ran one after the other, each under a different load of the machine.
 The throughput depends on this load: a ratio above 1 is its effect. The ratios therefore neither

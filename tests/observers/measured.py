@@ -36,16 +36,17 @@ The observers follow measured records, and the estimated force is compared with 
 - EMPS is a positioning stage without a spring. Its model has mass and viscous damping, but not the
   dry friction. The friction force was not measured: the reference is the force smoothed after the
   run.
-- The MR damper was measured on a dyno with a load cell. From its record, a bench without gravity is
-  constructed in which the damper carries a body of 100 kg: the applied force is the force that gives
-  this body the smoothed motion against the measured force of the damper. The observer uses this
-  force and the unsmoothed displacement; the reference is the load cell.
+- The MR damper was measured on a dyno with a load cell. From its record, a bench without
+  gravity is constructed in which the damper carries a body of 100 kg: the applied force is the
+  force that gives this body the smoothed motion against the measured force of the damper. The
+  observer uses this force and the unsmoothed displacement; the reference is the load cell.
 
-An error is the RMS error relative to the standard deviation of the reference force. A first pass
-with an untuned noise-aware observer determines the longest section in which it is never interrupted;
-the error is evaluated at the valid ticks of this section, without its first 0.5 s. The share of valid
-ticks is in parentheses if it is below 100 %. `lost` stands for an error of more than twice the
-standard deviation. The observers are tuned on the record on which they are evaluated.
+An error is the RMS error relative to the standard deviation of the reference force. A first
+pass with an untuned noise-aware observer determines the longest section in which it is never
+interrupted; the error is evaluated at the valid ticks of this section, without its first 0.5 s.
+The share of valid ticks is in parentheses if it is below 100 %. `lost` stands for an error of
+more than twice the standard deviation. The observers are tuned on the record on which they are
+evaluated.
 """
 
 MODEL = """
