@@ -1,8 +1,9 @@
 """YAML from outside, read as data: bounded, without aliases or repeated keys, then validated."""
 
 import re
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, TypeVar, cast
 
 import yaml
@@ -178,13 +179,24 @@ def validate(model: type[_Model], data: object, source: str, context: object = N
         raise FileError(_one_line(error, model, source)) from error
 
 
-def load_yaml(model: type[_Model], path: Path, context: object = None) -> _Model:
+def load_yaml(
+    model: type[_Model],
+    path: Path,
+    context: object = None,
+    kinds: Mapping[str, str] = MappingProxyType({}),
+) -> _Model:
     """The file at `path` as a frozen `model`; `context` as of `validate`.
+
+    `kinds` states by a key of other files what they are: a file with such a key is named as one.
 
     Raises:
         FileError: One line that names file, key, value and what was expected.
     """
-    return validate(model, parse_mapping(read_text(path), str(path)), str(path), context)
+    content = parse_mapping(read_text(path), str(path))
+    for key, kind in kinds.items():
+        if key in content and key not in model.model_fields:
+            raise FileError(f"{path}: is {kind}")
+    return validate(model, content, str(path), context)
 
 
 _NO_MAPPING = ("dict_type", "model_type", "model_attributes_type", "dataclass_type")

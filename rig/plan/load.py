@@ -7,6 +7,7 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import load_model, load_named_model
+from rig.files.file_kinds import FILE_KINDS
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunHeader, read_header
 from rig.plan.config import RunConfig
@@ -22,7 +23,7 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    config = load_yaml(RunConfig, path)
+    config = load_yaml(RunConfig, path, kinds=FILE_KINDS)
     if duration_s is not None:
         if not 0.0 < duration_s < float("inf"):
             raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from can_dbc.yaml_file import load_yaml
+from rig.files.file_kinds import FILE_KINDS
 from rig.simulated_bench.assembly import assemble
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError
 
@@ -16,7 +17,7 @@ def load_bench_config(path: Path) -> BenchConfig:
         InputError: The file cannot be read or does not describe a bench; one line naming file,
             key, value and expectation.
     """
-    config = load_yaml(BenchConfig, path, context=path.parent)
+    config = load_yaml(BenchConfig, path, path.parent, FILE_KINDS)
     try:
         assemble(config)
     except BenchConfigError as error:

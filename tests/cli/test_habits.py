@@ -9,6 +9,7 @@ import pytest
 import typer
 import yaml
 
+from dart_model.spec import MODELS
 from rig.bridge.counts import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
 from rig.cli.main import app, main
@@ -124,6 +125,19 @@ def test_a_replay_as_json(monkeypatch, capsys, tmp_path):
     assert found["different_ticks"] == 0
     assert found["ticks"] == 200
     assert found["changed_files"] == []
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["run", CONFIGS / "reference_bench.yaml"], "is a simulated bench: `rig bench` runs it"),
+        (["check", MODELS / "reference.yaml"], "is a model: `model:` of a configuration"),
+        (["bench", CONFIGS / "reference.yaml"], "is a configuration of the bridge: `rig run`"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(monkeypatch, capsys, given, says):
+    assert rig(monkeypatch, *given) == 2
+    assert says in capsys.readouterr().err
 
 
 def test_no_name_is_cut_in_a_table(capsys):
