@@ -45,6 +45,10 @@ _MOST_POINTS = 16
 """Points beside the plot on one page; those of more urgent verdicts and smaller margins first."""
 
 
+_MOST_NAMED = 3
+"""Points that a sentence names."""
+
+
 class PointRow(NamedTuple):
     """A point of the band as a row: its side, verdict with colour and sign, and texts."""
 
@@ -118,14 +122,14 @@ def _words_of_points(points: Sequence[PointVerdict]) -> str:
     for verdict, words in (
         ("fail", "outside the tolerance"),
         ("not measured", "not measured"),
-        ("open", "not proven: the interval of the force crosses a limit"),
+        ("open", "not proven, since the interval of the force contains a limit"),
     ):
         mine = [point for point in points if point.verdict == verdict]
         if mine:
             count = f"{len(mine)} of {len(points)} points {words}"
             worst = min(mine, key=lambda point: point.margin_n or 0.0)
             if verdict != "fail" or worst.margin_n is None:
-                return count
+                return f"{count}: {', '.join(_place(point) for point in mine[:_MOST_NAMED])}"
             beyond = with_unit(three_digits(-worst.margin_n), "N")
             return f"{count}, {_place(worst)} by {beyond}"
     return f"All {len(points)} points within the tolerance"

@@ -12,7 +12,7 @@ from pathlib import Path
 _UPLOT = Path(str(resources.files("uplot.static")))
 _HERE = Path(__file__).parent
 
-STYLES = (_UPLOT / "uPlot.min.css",)
+STYLES = (_UPLOT / "uPlot.min.css", _HERE / "charts.css")
 """Style sheets that a page with charts needs."""
 
 SCRIPTS = (_UPLOT / "uPlot.iife.js", _HERE / "charts.js")

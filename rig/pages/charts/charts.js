@@ -176,8 +176,8 @@ const Charts = (() => {
     ctx.stroke();
   };
 
-  // Samples of lines are filled, and empty for dashed ones.
-  const markers = { fill: (u, i) => (u.series[i].dash ? "transparent" : u.series[i].stroke(u, i)), width: 2 };
+  // Samples of lines are dashed as they are; those of points are filled.
+  const markers = { fill: (u, i) => u.series[i].stroke(u, i), dash: (u, i) => (u.series[i].dash ? "dashed" : "solid"), width: 2 };
 
   // A figure of one chart, whose head has a place for the legend.
   const figureOf = (element) => element.closest(".figure[data-chart]");
@@ -354,6 +354,7 @@ const Charts = (() => {
         // An empty series has no entry in the legend.
         legend.querySelectorAll(".u-series").forEach((entry, i) => {
           entry.hidden = pairs[i][0].length === 0;
+          entry.classList.toggle("dots", Boolean(spec.series[i].dots));
         });
       },
       redraw: () => chart.redraw(false, true),

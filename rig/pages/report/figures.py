@@ -103,28 +103,34 @@ def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
     return _BOTH if corrected else _BOTH[:1]
 
 
-def finding_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot | None:
+def finding_plot(
+    key: str, series: Sequence[FittedSeries], points: int, *, corrected: bool
+) -> Plot | None:
     """Residual force over the coordinate that shows it best, its correction and what is left.
 
-    The correction is the mean over the recordings at each height, or at each velocity.
+    The correction is the mean over the recordings at each height, or at each velocity; where
+    nothing was corrected, it is that of the residual force.
     """
     joined = _residuals(series)
     there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
     if len(there) < _BINS:
         return None
     before, after = joined.values[there, 2], joined.values[there, 3]
+    sought = before - after if corrected else before
     column, mean = max(
-        ((i, _mean_over(joined.values[there, i], before - after)) for i in (0, 1)),
+        ((i, _mean_over(joined.values[there, i], sought)) for i in (0, 1)),
         key=lambda item: -float(np.mean((before - item[1]) ** 2)),
     )
     against: Array = joined.values[there, column]
     kept = cloud(against, np.column_stack([before, after]), points // 2)
     kept = kept[np.argsort(against[kept], kind="stable")]
     quantity = (HEIGHT, VELOCITY)[column]
-    styles = (
-        LineStyle("residual force before", "--before", (), 1.6),
-        LineStyle("left after the correction", "--after", (), 1.6),
-        LineStyle("correction, mean", "--law", (7, 4), 2.4, is_line=True),
+    points_of = LineStyle("residual force", "--before", (), 1.6), before[kept]
+    left = LineStyle("left after the correction", "--after", (), 1.6), after[kept]
+    name = "correction, mean" if corrected else "mean"
+    line = LineStyle(name, "--law", (7, 4), 2.4, is_line=True), mean[kept]
+    styles, values = zip(
+        *((points_of, left, line) if corrected else (points_of, line)), strict=True
     )
     panel = Panel(
         "points",
@@ -132,7 +138,7 @@ def finding_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot 
         RESIDUAL_FORCE.label,
         against[kept],
         styles,
-        [before[kept], after[kept], mean[kept]],
+        values,
         {"reach": _finite(_reach_n(joined))},
     )
     caption = f"The force that the nominal model lacks, over {quantity.name} ({_SMOOTHED_BAND})."

@@ -238,7 +238,7 @@ def _error(diagnosis: Diagnosis) -> str:
     else:
         name, factor, unit = "Height error", 1e3, "mm"
     before, after = (three_digits(factor * it) for it in (figure.before, figure.after))
-    if diagnosis.verdict == "nothing_missing" and before == after:
+    if before == after:
         return f"{name} {with_unit(before, unit)} {_NOT_USED}."
     return f"{name} {before} → {with_unit(after, unit)} {_NOT_USED}."
 
@@ -269,7 +269,11 @@ def _load_cell(diagnosis: Diagnosis) -> Statement:
     figure = diagnosis.held_out.strut_force_rmse_n
     if figure is None or not math.isfinite(figure.after):
         return Statement("idle", "–", "No load cell: the strut's force itself was not compared.")
+    if is_prescribed(diagnosis):
+        return Statement("idle", "–", "The force error is the difference from the load cell.")
     before, after = quantity(figure.before, "N"), quantity(figure.after, "N")
+    if before == after:
+        return Statement("idle", "–", f"The load cell differs by {before} RMS from the model.")
     if figure.after < figure.before:
         text = f"The load cell agrees better: its difference falls from {before} to {after} RMS."
         return Statement("good", "✓", text)

@@ -126,7 +126,8 @@ def _finding_plot(result: Result) -> Plot | None:
         strut: sum(float(np.nansum(it.residual_before_n**2)) for it in series)
         for strut, series in by_strut.items()
     }
-    return finding_plot("first", by_strut[max(lacking, key=lacking.__getitem__)], _POINTS)
+    most = by_strut[max(lacking, key=lacking.__getitem__)]
+    return finding_plot("first", most, _POINTS, corrected=_has_corrections(result.diagnosis))
 
 
 def _corrected_text(result: Result) -> str:
