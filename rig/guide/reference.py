@@ -177,9 +177,25 @@ def _effects(pictures: Path | None) -> str:
     return "\n\n".join(parts)
 
 
+_UNBOUNDED = 1e4
+"""Magnitude from which on a bound only keeps numbers finite."""
+
+_LEAST_POSITIVE = 1e-9
+"""Up to it, a lower bound only keeps a parameter above zero."""
+
+
+def range_text(low: float, high: float) -> str:
+    """The range of a parameter in words, without bounds that only keep numbers finite."""
+    if high < _UNBOUNDED:
+        return f"{low:g} to {high:g}"
+    if low <= -_UNBOUNDED:
+        return "any"
+    return "above 0" if 0.0 < low <= _LEAST_POSITIVE else f"{low:g} or more"
+
+
 def _effect(item: Effect, pictures: Path | None) -> str:
     rows = [
-        (f"`{it.name}`", it.unit or "-", f"{it.low:g} to {it.high:g}", it.meaning)
+        (f"`{it.name}`", it.unit or "-", range_text(it.low, it.high), it.meaning)
         for it in item.parameters[:_MOST_PARAMETERS]
     ]
     more = len(item.parameters) - _MOST_PARAMETERS

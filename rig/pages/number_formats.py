@@ -48,7 +48,7 @@ def quantity(value: float, unit: str) -> str:
     scaled = value * factor
     if scaled == 0.0:
         return with_unit("0", unit)
-    if not 1e-3 <= abs(scaled) < 1e7:
+    if not 1e-6 <= abs(scaled) < 1e7:
         return with_unit(f"{scaled:.2e}".replace("-", _MINUS), name)
     return with_unit(three_digits(scaled), name)
 

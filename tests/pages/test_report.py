@@ -480,7 +480,8 @@ def test_every_law_can_be_reported(law) -> None:
         (-52340.0, "N/m", "−52\u202f300 N/m"),
         (1.5, "", "1.50"),
         (math.nan, "N", "–"),
-        (1e-6, "N", "1.00e−06 N"),
+        (5.87e-4, "N", "0.000587 N"),
+        (1e-7, "N", "1.00e−07 N"),
     ],
 )
 def test_quantities_are_written_as_engineers_do(value: float, unit: str, text: str) -> None:

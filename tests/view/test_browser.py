@@ -15,12 +15,18 @@ import numpy as np
 import pytest
 import yaml
 
+from rig.dyno.faults import MasterComparison
+from rig.dyno.report import DamperReport
+from rig.dyno.tolerance import BandPoint, ToleranceBand, evaluate_band
 from rig.log.reader import read_run
+from rig.pages.browser_print import print_page
+from rig.pages.characteristics_page import write_characteristics_page
 from rig.pages.number_formats import number
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
 from rig.run.changed_settings import read_changes
 from rig.run.replay import replay
+from tests.dyno.test_comparison import state
 from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
 from tests.view.serving import COUNT, make_run, serving
@@ -172,6 +178,82 @@ def test_reports_keep_nobody_out(made, run, tmp_path, kind, width):
     assert serious == [], [(item["id"], item["nodes"][0]["html"]) for item in serious]
     assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert errors == []
+    opened.close()
+
+
+A4 = {"width": 703, "height": 1032}
+"""The area of an A4 page within margins of 12 mm, in px of 1/96 in."""
+
+
+def printed(made, path):
+    """A report as it is laid out on paper."""
+    opened = made.new_page(viewport=A4)
+    opened.goto(path.as_uri())
+    opened.emulate_media(media="print")
+    opened.evaluate("dispatchEvent(new Event('beforeprint'))")
+    opened.wait_for_timeout(300)
+    return opened
+
+
+@pytest.mark.parametrize("kind", ["run", "diagnosis"])
+def test_no_chart_is_cut_on_paper(made, run, tmp_path, kind):
+    path = tmp_path / "report.html"
+    if kind == "run":
+        write_run_report(run, path)
+    else:
+        path.write_text(page_of(report()), "utf-8")
+    opened = printed(made, path)
+    heights = opened.evaluate(
+        "[...document.querySelectorAll('.figure')].map((f) => f.getBoundingClientRect().height)"
+    )
+    assert len(heights) >= 1
+    assert max(heights) < A4["height"]
+    assert opened.evaluate("document.documentElement.scrollWidth") <= A4["width"]
+    opened.close()
+
+
+def sheet(tmp_path, speeds):
+    """The sheet of a damper with a band at some speeds and a master."""
+    record = state(1)
+    limits = {"compression_low_n": 0.0, "compression_high_n": 700.0}
+    limits |= {"rebound_low_n": -300.0, "rebound_high_n": 300.0}
+    band = ToleranceBand(
+        name="band", points=tuple(BandPoint(velocity_m_per_s=v, **limits) for v in speeds)
+    )
+    good = MasterComparison((), True, 1.0)
+    path = tmp_path / "report.html"
+    points = evaluate_band(record.steps, band)
+    write_characteristics_page(
+        [DamperReport(record, points, good, state(3))], path, {"serial": "0815"}
+    )
+    return path
+
+
+@pytest.mark.parametrize("points", [1, 8, 20])
+def test_a_damper_sheet_is_one_page_of_a4(made, tmp_path, points):
+    opened = printed(made, sheet(tmp_path, np.linspace(0.02, 0.29, points).round(4).tolist()))
+    end = opened.evaluate("document.querySelector('.sheet').getBoundingClientRect().bottom")
+    assert end < A4["height"]
+    methods = opened.locator(".next-page").first
+    assert methods.evaluate("(e) => getComputedStyle(e).breakBefore") == "page"
+    assert opened.get_by_text("Signature").is_visible()
+    opened.close()
+    if points == 8:
+        path = tmp_path / "report.pdf"
+        print_page(tmp_path / "report.html", path)
+        assert path.read_bytes().count(b"/Type /Page\n") == 2
+
+
+@pytest.mark.parametrize("width", [1100, 390])
+def test_a_damper_sheet_keeps_nobody_out(made, tmp_path, width):
+    opened = made.new_page(viewport={"width": width, "height": 900})
+    opened.goto(sheet(tmp_path, [0.1, 0.2]).as_uri())
+    found = axe.Axe().run(opened).response["violations"]
+    serious = [item for item in found if item["impact"] in ("serious", "critical")]
+    assert serious == [], [(item["id"], item["nodes"][0]["html"]) for item in serious]
+    assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert opened.locator(".stamp").inner_text().endswith("PASS")
+    assert not opened.get_by_text("Signature").is_visible()
     opened.close()
 
 

@@ -27,7 +27,7 @@ function draw(element, panel) {
 
 for (const data of document.querySelectorAll("script[data-plot]")) {
   const elements = document.getElementById(data.dataset.plot).querySelectorAll(".chart");
-  const half = elements[0].parentElement.classList.contains("panels2");
+  const half = elements[0].closest(".panels2, .first") !== null;
   JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, element: elements[i], ...draw(elements[i], panel) }));
 }
 window.addEventListener("beforeprint", () => {
