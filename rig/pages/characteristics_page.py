@@ -147,7 +147,7 @@ def _forces(record: Characteristics) -> str:
 
 
 def _place(point: PointVerdict) -> str:
-    return f"{point.side} at {with_unit(f'{point.velocity_m_per_s:g}', 'm/s')}"
+    return f"{point.side} at {with_unit(f'{point.velocity_m_per_s:.3g}', 'm/s')}"
 
 
 def _point_rows(points: Sequence[PointVerdict]) -> list[PointRow]:
@@ -165,7 +165,7 @@ def _point_row(point: PointVerdict) -> PointRow:
         point.verdict,
         mark.colour,
         mark.sign,
-        f"{point.velocity_m_per_s:g}",
+        f"{point.velocity_m_per_s:.3g}",
         "–" if point.force is None else with_half(point.force),
         f"{number(point.low_n, 0)} to {number(point.high_n, 0)}",
         "–" if margin_n is None else f"{plus}{three_digits(margin_n)}",

@@ -174,8 +174,8 @@ def _lost(damage: Sequence[Damage]) -> str:
 
 def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     begin_s, end_s = follower.span_s
-    rate_hz = header.get("config", {}).get("rate_hz", "?")
-    text = f"{end_s - begin_s:.1f} s at {rate_hz} Hz"
+    rate_hz = header.get("config", {}).get("rate_hz", math.nan)
+    text = f"{end_s - begin_s:.1f} s at {rate_hz:g} Hz"
     if not ending:
         return f"{text}; its end is not recorded."
     faults = "; ".join(f"{count} {name}" for name, count in _counts(ending))

@@ -160,7 +160,7 @@ function build() {
       { label: named(i, "last cycle"), colour, width: 2.4 },
     ];
   });
-  const laws = runs.map((_run, i) => ({ label: named(i, "model’s law"), colour: several ? COLOURS[i % 4] : "--law", dash: [8, 4] }));
+  const laws = runs.map((_run, i) => ({ label: named(i, "law"), colour: several ? COLOURS[i % 4] : "--law", dash: [8, 4] }));
   const others = runs[0].models.map((name, i) => ({ label: `law of ${name}`, colour: "--fourth", dash: DASHES[i % 4] }));
   for (const quantity of Object.values(planes.motions)) {
     const leastX = unitOf(quantity.unit)[0] * quantity.least_span;
