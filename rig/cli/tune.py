@@ -150,7 +150,7 @@ def tune_command(
         print_json([_as_dict(strut) for strut in struts])
         return
     for strut in struts:
-        _print(strut, damping_ratio)
+        _print(strut, damping_ratio, _cycle_of_applied_force_ms(plan))
     for path in (out, plot):
         if path is not None:
             print_text(f"Written: {path}")
@@ -202,7 +202,15 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
     }
 
 
-def _print(strut: "TunedStrut", damping_ratio: float) -> None:
+def _cycle_of_applied_force_ms(plan: "Plan") -> float:
+    """Cycle of the applied force's message; 0 without one."""
+    from rig.channels.measured_quantities import APPLIED_FORCE
+
+    channel = plan.bench_channel(APPLIED_FORCE)
+    return 0.0 if channel is None else 1e-6 * channel.interval_ns
+
+
+def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> None:
     from rig.tuning.gains import LEAST_IN_MOTION
     from rig.tuning.tune import settings_of
 
@@ -216,11 +224,11 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
     if expectation.by_late_force_n > _WORTH_A_LINE * rms_n:
         print_text(
             f"Of it, {expectation.by_late_force_n:.3g} N RMS are proportional to the rate of the "
-            "applied force, which reaches the model later than the height. `rig diagnose` "
+            "applied force, which acts later in the loop than the height. `rig diagnose` "
             "and `rig evaluate` use the times of the samples and do not contain this part."
         )
     if strut.latency is not None:
-        _print_latency(strut.latency, is_set=bool(strut.delay_s))
+        _print_latency(strut.latency, force_cycle_ms, is_set=bool(strut.delay_s))
     slowest = ", ".join(
         f"{pole.frequency_hz:.3g} Hz with {pole.damping_ratio:.2f}"
         for pole in chosen.expected.poles[:6]
@@ -255,7 +263,7 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
         )
 
 
-def _print_latency(latency: "Latency", *, is_set: bool) -> None:
+def _print_latency(latency: "Latency", force_cycle_ms: float, *, is_set: bool) -> None:
     low_ms, value_ms, high_ms = (
         1e3 * it for it in (latency.low_s, latency.delay_s, latency.high_s)
     )
@@ -266,8 +274,15 @@ def _print_latency(latency: "Latency", *, is_set: bool) -> None:
         )
     elif high_ms < 0.0:
         print_text(
-            f"Latency of the height: none. The applied force arrives {-value_ms:.3g} ms later than "
-            f"the height (95 %: {-high_ms:.3g} to {-low_ms:.3g} ms)."
+            f"Latency of the height: none. In the loop, the applied force acts {-value_ms:.3g} ms "
+            f"late (95 %: {-high_ms:.3g} to {-low_ms:.3g} ms). At a tick, its newest sample is up "
+            f"to one cycle of its message old ({force_cycle_ms:.3g} ms), without a fault of the "
+            "sensor. "
+            + (
+                "The rest is a delay of the sensor, its filter or the bus."
+                if -high_ms > force_cycle_ms
+                else "Nothing is to be set."
+            )
         )
     else:
         verdict = "" if is_set else "; indistinguishable from zero, so none is set"

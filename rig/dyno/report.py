@@ -88,6 +88,8 @@ def evaluate_records(
     Raises:
         InputError: A record cannot be characterised, or not be compared with the master.
     """
+    if master is not None and any(path.resolve() == master.resolve() for path in paths):
+        raise InputError(f"--master {master}: is the record itself, expected that of a good damper")
     records = [characterise(path, strut) for path in paths]
     good = None if master is None else characterise(master, strut)
     model = None if good is None else master_of(good)

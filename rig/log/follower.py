@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from rig.bridge.values import Request
+from rig.bridge.values import Mode, Request
 from rig.log.file_names import STEPS_FILE, part_name
 from rig.log.step_columns import BUS_FAULT, END_OF_STREAM, LOG_FAULT, REQUEST_FLAGS, step_schema
 
@@ -35,6 +35,13 @@ FORCE_ERROR = "force_error_n"
 """Column of the estimated force less that of the load cell, where the model has one strut; NaN in
 cycles without a sample or a valid estimate. Extremes of two curves would not give those of their
 difference."""
+
+_INNOVATION = ".innovation_m"
+"""End of the name of a column that says nothing where no height arrives: it keeps its last value,
+or is zero, and reads as a perfect match."""
+
+_APART = tuple(float(mode) for mode in (Mode.WAITING, Mode.HOLD, Mode.SAFE))
+"""Modes in which the model does not follow the bench."""
 
 _CELL, _FORCE = "strut_force_n", ".force_n"
 """Column of the load cell, and end of the name of that of a strut's estimate."""
@@ -263,6 +270,11 @@ class _Growing:
 
 def _matrix(table: pa.Table) -> Array:
     columns = [np.asarray(column.to_numpy(), np.float64) for column in table.columns]
+    mode = columns[table.schema.names.index("mode")]
+    is_apart = np.isin(mode, _APART)
+    for index, name in enumerate(table.schema.names):
+        if name.endswith(_INNOVATION):
+            columns[index] = np.where(is_apart, np.nan, columns[index])
     flags = table.column("flags").to_numpy()
     bits = [(flags & bit > 0).astype(np.float64) for bit in FLAGS.values()]
     return np.column_stack([*columns, *bits, _force_error(table.schema.names, columns)])

@@ -6,7 +6,7 @@ record run from light to dark with their speed, which stands at each curve; seve
 colour each.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from rig.dyno.strokes import Array
 from rig.dyno.tolerance import PointVerdict
 from rig.files.pictures import new_figure
 from rig.pages.html import svg_url
+from rig.pages.plotted_quantities import us_units
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 RECORD_COLOURS = ("#111111", "#0072b2", "#d55e00", "#a3458f", "#007a58", "#7f6000")
@@ -59,6 +60,22 @@ _LABEL_SPACE = 0.055
 """Share of an axis within which a second label is left out."""
 
 
+class PlotUnits(NamedTuple):
+    """Units of a plot: factor to and name of that of forces, of velocities and of displacements."""
+
+    force: tuple[float, str]
+    velocity: tuple[float, str]
+    displacement: tuple[float, str]
+
+
+_US = us_units()
+SYSTEMS = {
+    "si": PlotUnits((1.0, "N"), (1.0, "m/s"), (1e3, "mm")),
+    "us": PlotUnits(_US["N"], _US["m/s"], _US["m"]),
+}
+"""Units of both versions of a plot."""
+
+
 class DamperPictures(NamedTuple):
     """The three plots as SVG in data URLs."""
 
@@ -67,70 +84,78 @@ class DamperPictures(NamedTuple):
     heights: str
 
 
-def draw_damper(reports: Sequence[DamperReport]) -> DamperPictures:
-    """The plots of one record, or of several superimposed; band and master are the first one's."""
+def draw_damper(reports: Sequence[DamperReport]) -> dict[str, DamperPictures]:
+    """The plots of one record, or of several superimposed, by system of units.
+
+    Band and master are the first one's.
+    """
+    return {system: _draw_in(units, reports) for system, units in SYSTEMS.items()}
+
+
+def _draw_in(units: PlotUnits, reports: Sequence[DamperReport]) -> DamperPictures:
     with new_figure((5.6, 4.2), _STYLE) as figure:
-        _draw_peaks(figure.subplots(), reports)
+        _draw_peaks(figure.subplots(), reports, units)
         peaks = svg_url(figure)
     loops: list[str] = []
     for draw in (_draw_velocities, _draw_heights):
         with new_figure((4.4, 3.1), _STYLE) as figure:
             axes = figure.subplots()
             axes.axhline(0.0, color=_AXIS, linewidth=0.8)
-            draw(axes, [report.characteristics for report in reports])
+            draw(axes, [report.characteristics for report in reports], units)
             loops.append(svg_url(figure))
     return DamperPictures(peaks, *loops)
 
 
-def _draw_peaks(axes: Any, reports: Sequence[DamperReport]) -> None:
+def _draw_peaks(axes: Any, reports: Sequence[DamperReport], units: PlotUnits) -> None:
     """Force at peak velocity over peak velocity, with band and master."""
     first, points = reports[0], reports[0].points
-    _draw_band(axes, points)
+    _draw_band(axes, points, units)
     if first.master is not None:
         for side in SIDES:
-            speeds, forces_n, _ = _peaks(first.master, side)
+            speeds, forces_n, _ = _peaks(first.master, side, units)
             name = f"master: {first.master.name}" if side == SIDES[0] else None
             style = {"color": _MASTER, "dashes": (5, 3), "linewidth": 1.8, "label": name}
             axes.plot(speeds, forces_n, **style)
     for index, report in enumerate(reports):
         item, (colour, dash) = report.characteristics, _look(index)
         for side, marker in zip(SIDES, ("o", "s"), strict=True):
-            speeds, forces_n, halves_n = _peaks(item, side)
+            speeds, forces_n, halves_n = _peaks(item, side, units)
             name = item.name if side == SIDES[0] else None
             axes.errorbar(
                 speeds, forces_n, yerr=halves_n, color=colour, linestyle=dash, capsize=2.5,
                 linewidth=1.4, marker="." if report.points else marker, markersize=5, label=name,
             )  # fmt: skip
-    _draw_verdicts(axes, points)
+    _draw_verdicts(axes, points, units)
     axes.axhline(0.0, color=_AXIS, linewidth=0.8)
     axes.set_xlim(left=0.0)
     axes.locator_params(axis="x", nbins=7)
     axes.set(
         title="Force at peak velocity over peak velocity (PVP)",
-        xlabel="peak velocity / (m/s)",
-        ylabel="force / N     ← rebound · compression →",
+        xlabel=f"peak velocity / ({units.velocity[1]})",
+        ylabel=f"force / {units.force[1]}     ← rebound · compression →",
     )
     axes.legend(fontsize="small", loc="best")
 
 
-def _peaks(item: Characteristics, side: str) -> tuple[Array, Array, Array]:
+def _peaks(item: Characteristics, side: str, units: PlotUnits) -> tuple[Array, Array, Array]:
     """Peak velocities, forces there, and how far their intervals reach below and above, (2, n)."""
     steps = sorted(item.steps, key=lambda step: step.peak_speed_m_per_s)
     sides = [getattr(step, side) for step in steps]
     figures = [each.force_at_peak_velocity_n for each in sides]
     return (
-        np.array([each.peak_velocity_m_per_s.value for each in sides]),
-        np.array([figure.value for figure in figures]),
-        np.array([[f.value - f.low, f.high - f.value] for f in figures]).T,
+        units.velocity[0] * np.array([each.peak_velocity_m_per_s.value for each in sides]),
+        units.force[0] * np.array([figure.value for figure in figures]),
+        units.force[0] * np.array([[f.value - f.low, f.high - f.value] for f in figures]).T,
     )
 
 
-def _draw_band(axes: Any, points: Sequence[PointVerdict]) -> None:
+def _draw_band(axes: Any, points: Sequence[PointVerdict], units: PlotUnits) -> None:
     """Draw the band of each side; a band of one point is a bar."""
     for side in SIDES:
         mine = [point for point in points if point.side == side]
-        speeds = [point.velocity_m_per_s for point in mine]
-        low, high = [point.low_n for point in mine], [point.high_n for point in mine]
+        speeds = [units.velocity[0] * point.velocity_m_per_s for point in mine]
+        low = [units.force[0] * point.low_n for point in mine]
+        high = [units.force[0] * point.high_n for point in mine]
         name = "tolerance" if side == SIDES[0] else None
         style = {"color": "#8794a1", "alpha": 0.28, "label": name, "zorder": 0}
         if len(mine) > 1:
@@ -139,12 +164,14 @@ def _draw_band(axes: Any, points: Sequence[PointVerdict]) -> None:
             axes.vlines(speeds, low, high, linewidth=9.0, **style)
 
 
-def _draw_verdicts(axes: Any, points: Sequence[PointVerdict]) -> None:
+def _draw_verdicts(axes: Any, points: Sequence[PointVerdict], units: PlotUnits) -> None:
     """Draw each point of the band that was measured, and how far those beyond it are off."""
     for verdict, mark in VERDICT_MARKS.items():
         mine = [point for point in points if point.verdict == verdict]
         known = [
-            (point.velocity_m_per_s, point.force.value) for point in mine if point.force is not None
+            (units.velocity[0] * point.velocity_m_per_s, units.force[0] * point.force.value)
+            for point in mine
+            if point.force is not None
         ]
         if not known:
             continue
@@ -157,43 +184,46 @@ def _draw_verdicts(axes: Any, points: Sequence[PointVerdict]) -> None:
             for point, place in zip(mine, known, strict=True):
                 offset = (7, -11) if point.side == SIDES[0] else (7, 4)
                 axes.annotate(
-                    f"−{-(point.margin_n or 0.0):.3g} N", place, xytext=offset,
+                    f"−{-units.force[0] * (point.margin_n or 0.0):.3g} {units.force[1]}", place,
+                    xytext=offset,
                     textcoords="offset points", color=mark.colour, fontsize="small",
                 )  # fmt: skip
 
 
-def _draw_velocities(axes: Any, records: Sequence[Characteristics]) -> None:
+def _draw_velocities(axes: Any, records: Sequence[Characteristics], units: PlotUnits) -> None:
     axes.axvline(0.0, color=_AXIS, linewidth=0.8)
     for _, step, style in _curves(records):
         for stroke in step.strokes:
-            axes.plot(stroke.velocity_m_per_s, stroke.force_n, **style)
+            velocity = units.velocity[0] * stroke.velocity_m_per_s
+            axes.plot(velocity, units.force[0] * stroke.force_n, **style)
             style.pop("label", None)
     axes.locator_params(axis="x", nbins=6)
-    _label_steps(axes, records, _fastest_point)
+    _label_steps(axes, records, _fastest_point, units)
     axes.set(
         title="Force over velocity (CVP)",
-        xlabel="velocity / (m/s)     ← compression · rebound →",
-        ylabel="force / N",
+        xlabel=f"velocity / ({units.velocity[1]})     ← compression · rebound →",
+        ylabel=f"force / {units.force[1]}",
     )
     _add_legend(axes, records)
 
 
-def _draw_heights(axes: Any, records: Sequence[Characteristics]) -> None:
+def _draw_heights(axes: Any, records: Sequence[Characteristics], units: PlotUnits) -> None:
     if len(records) == 1:
         record, step = records[0].record, records[0].steps[-1]
         every = max(1, len(record.height_m) // _MOST_SAMPLES)
-        displacement_mm = 1e3 * (record.height_m[::every] - step.middle_m)
+        displacement = units.displacement[0] * (record.height_m[::every] - step.middle_m)
         style = {"color": "#9aa5b1", "markersize": 1.3, "zorder": 1, "rasterized": True}
-        axes.plot(displacement_mm, record.force_n[::every], ".", **style)
+        axes.plot(displacement, units.force[0] * record.force_n[::every], ".", **style)
     for _, step, style in _curves(records):
         for stroke in step.strokes:
-            axes.plot(_displacement_mm(step, stroke), stroke.force_n, **style)
+            displacement = units.displacement[0] * _displacement_m(step, stroke)
+            axes.plot(displacement, units.force[0] * stroke.force_n, **style)
             style.pop("label", None)
-    _label_steps(axes, records, _middle_point)
+    _label_steps(axes, records, _middle_point, units)
     axes.set(
         title="Force over displacement (F-x)",
-        xlabel="displacement from mid-stroke / mm",
-        ylabel="force / N",
+        xlabel=f"displacement from mid-stroke / {units.displacement[1]}",
+        ylabel=f"force / {units.force[1]}",
     )
     _add_legend(axes, records)
 
@@ -223,33 +253,40 @@ def _look(index: int) -> tuple[str, str]:
     )
 
 
-def _displacement_mm(step: DynoStep, stroke: MeanStroke) -> Array:
+def _displacement_m(step: DynoStep, stroke: MeanStroke) -> Array:
     sine = stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
-    return 1e3 * (stroke.middle_m - step.middle_m + sine)
+    return stroke.middle_m - step.middle_m + sine
 
 
-def _fastest_point(step: DynoStep) -> tuple[float, float]:
+def _fastest_point(step: DynoStep, units: PlotUnits) -> tuple[float, float]:
     """Velocity and force at the peak velocity of rebound."""
     stroke = step.strokes[1]
     at = int(np.argmax(np.abs(stroke.velocity_m_per_s)))
-    return float(stroke.velocity_m_per_s[at]), float(stroke.force_n[at])
+    velocity = units.velocity[0] * stroke.velocity_m_per_s[at]
+    return float(velocity), units.force[0] * float(stroke.force_n[at])
 
 
-def _middle_point(step: DynoStep) -> tuple[float, float]:
+def _middle_point(step: DynoStep, units: PlotUnits) -> tuple[float, float]:
     """Displacement and force at mid-stroke of compression."""
     stroke = step.strokes[0]
     at = len(ANGLES) // 2
-    return float(_displacement_mm(step, stroke)[at]), float(stroke.force_n[at])
+    displacement = units.displacement[0] * _displacement_m(step, stroke)[at]
+    return float(displacement), units.force[0] * float(stroke.force_n[at])
 
 
-def _label_steps(axes: Any, records: Sequence[Characteristics], point: Any) -> None:
+def _label_steps(
+    axes: Any,
+    records: Sequence[Characteristics],
+    point: Callable[[DynoStep, PlotUnits], tuple[float, float]],
+    units: PlotUnits,
+) -> None:
     """Write the speed of each step at its curve, the fastest first, where there is room."""
     if len(records) > 1:
         return
     spans = [max(float(np.ptp(axis)), 1e-300) for axis in (axes.get_xlim(), axes.get_ylim())]
     placed: list[tuple[float, float]] = []
     for step in sorted(records[0].steps, key=lambda it: -it.peak_speed_m_per_s):
-        x, y = point(step)
+        x, y = point(step, units)
         is_free = all(
             abs(y - other[1]) > _LABEL_SPACE * spans[1]
             or abs(x - other[0]) > 2.5 * _LABEL_SPACE * spans[0]
@@ -258,7 +295,8 @@ def _label_steps(axes: Any, records: Sequence[Characteristics], point: Any) -> N
         if is_free:
             placed.append((x, y))
             axes.annotate(
-                f"{step.peak_speed_m_per_s:.2g} m/s", (x, y), xytext=(3, 4),
+                f"{units.velocity[0] * step.peak_speed_m_per_s:.2g} {units.velocity[1]}", (x, y),
+                xytext=(3, 4),
                 textcoords="offset points", fontsize="x-small", color="#1f2933",
             )  # fmt: skip
 

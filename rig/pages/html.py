@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from can_dbc.atomic_file import write_durably
 from can_dbc.errors import InputError
 from rig.pages import charts
+from rig.pages.plotted_quantities import us_units
 
 _HERE = Path(__file__).parent
 _TEMPLATES = Environment(
@@ -27,11 +29,13 @@ def render(template: str, **content: object) -> str:
 def render_report(template: str, **content: object) -> str:
     """Text of a report, from a template in ``report``: it holds its charts' scripts and styles."""
     report = _HERE / "report"
-    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, report / "page.js")]
+    own = report / "units.js", report / "page.js"
+    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, *own)]
     return render(
         f"report/{template}",
         styles=[path.read_text("utf-8") for path in (*charts.STYLES, report / "page.css")],
         scripts=scripts,
+        us_units=json.dumps(us_units()),
         script_hashes=[_hash(script) for script in scripts],
         **content,
     )

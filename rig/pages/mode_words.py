@@ -71,7 +71,7 @@ _QUANTITIES: Mapping[str, tuple[str, str]] = {
     "virtual_force_n": ("virtual force", "N"),
     "force_std_n": ("standard deviation of the force", "N"),
     "force_rate_n_per_s": ("rate of the force", "N/s"),
-    "force_difference_n": ("force less that of the load cell", "N"),
+    "force_difference_n": ("difference of estimated force and load cell", "N"),
     "unchanged_s": ("time without a change", "s"),
     "age_s": ("age of the measurement", "s"),
     "gap_s": ("gap", "s"),
@@ -121,7 +121,7 @@ def describe_cause(event: LoggedEvent, *, with_strut: bool = True) -> str:
         name, unit = name_quantity(str(event["quantity"]))
         value, limit = (_amount(event.get(key), unit) for key in ("value", "limit"))
         if _is_within(event.get("value"), event.get("limit")):
-            words = f"{name} was beyond {limit}, now {value}"
+            words = f"{name} was beyond {limit}"
         elif cause in _WITH_VALUE:
             words = f"{words} {value} (limit {limit})"
         else:

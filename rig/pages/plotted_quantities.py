@@ -62,6 +62,19 @@ An inch is 0.0254 m and a pound-force 4.4482216152605 N by definition.
 """
 
 
+def us_units() -> dict[str, tuple[float, str]]:
+    """By a unit that reports show in SI: factor to and name of the US unit that replaces it."""
+    (metre, inch), (newton, pound) = UNITS["US"]["m"], UNITS["US"]["N"]
+    lengths = {"m": metre, "mm": 1e-3 * metre, "µm": 1e-6 * metre}
+    rates = {"N/m": f"{pound}/{inch}", "N·s/m": f"{pound}·s/{inch}"}
+    return {
+        **{unit: (factor, inch) for unit, factor in lengths.items()},
+        **{unit: of for unit, of in UNITS["US"].items() if unit != "m"},
+        **{unit: (newton / metre, name) for unit, name in rates.items()},
+        "N/K": (newton, f"{pound}/K"),
+    }
+
+
 class Origin(StrEnum):
     """Where the values of a curve come from."""
 

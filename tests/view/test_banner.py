@@ -51,7 +51,7 @@ def test_waiting_names_the_frame_and_its_bus():
         ),
         (
             {"cause": "beyond_safe", "quantity": "force_difference_n", "value": 3.0, "limit": 8.0},
-            "force less that of the load cell was beyond 8 N, now 3 N",
+            "difference of estimated force and load cell was beyond 8 N",
         ),
         (
             {"cause": "interlock_open", "quantity": "interlock", "value": 0.0, "limit": 1.0},

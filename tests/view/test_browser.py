@@ -244,6 +244,77 @@ def test_a_damper_sheet_is_one_page_of_a4(made, tmp_path, points):
         assert path.read_bytes().count(b"/Type /Page\n") == 2
 
 
+def test_a_report_is_shown_in_other_units_and_back(made, tmp_path):
+    opened = made.new_page(viewport={"width": 1100, "height": 900})
+    opened.goto(sheet(tmp_path, [0.1, 0.2]).as_uri())
+    before = opened.locator("main").inner_text()
+    shown = [opened.locator(f".sheet img.{system}").first for system in ("si", "us")]
+    assert [image.is_visible() for image in shown] == [True, False]
+    opened.locator("#units").select_option("US")
+    assert [image.is_visible() for image in shown] == [False, True]
+    text = opened.locator("main").inner_text()
+    force_n, half_n = opened.evaluate(
+        "[...document.querySelectorAll('.points tbody td')][1].textContent.split('±')"
+        ".map((part) => Number(part.replace('\u2212', '-')))"
+    )
+    record = state(1)
+    true_n = evaluate_band(record.steps, one_point_band())[0].force.value
+    assert force_n == pytest.approx(true_n / 4.4482216152605, abs=0.06)
+    assert half_n > 0.0
+    assert "lbf/in" in text
+    assert not re.search(r"\d\u00a0N\b", text)
+    opened.locator("#units").select_option("SI")
+    assert opened.locator("main").inner_text() == before
+    opened.close()
+
+
+def one_point_band():
+    return ToleranceBand(
+        name="band",
+        points=(
+            BandPoint(
+                velocity_m_per_s=0.1,
+                compression_low_n=0.0,
+                compression_high_n=700.0,
+                rebound_low_n=-300.0,
+                rebound_high_n=300.0,
+            ),
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "converted"),
+    [
+        ("9 160 ± 910 N", "2 059 ± 205 lbf"),
+        ("12.08 N (95 %: 11.83 to 12.36 N)", "2.716 lbf (95 %: 2.659 to 2.779 lbf)"),
+        ("Height error 2.31 → 0.0104 mm", "Height error 0.091 → 0.00041 in"),
+        ("−500 N/m³ and 3 kg", "−500 N/m³ and 3 kg"),
+        ("at 0.5 m/s, 100 N·s/m", "at 20 in/s, 0.57 lbf·s/in"),
+    ],
+)
+def test_quantities_in_a_text_are_converted(made, tmp_path, text, converted):
+    opened = made.new_page()
+    opened.goto(sheet(tmp_path, [0.1]).as_uri())
+    assert opened.evaluate("(text) => Units.quantities(text)", text) == converted
+    opened.close()
+
+
+def test_the_charts_of_a_report_change_their_units(made, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(page_of(report()), "utf-8")
+    opened, errors = made.new_page(viewport={"width": 1100, "height": 900}), []
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.goto(path.as_uri())
+    ends = "drawnPanels[0].chart.scales.y.max"
+    newtons = opened.evaluate(ends)
+    opened.locator("#units").select_option("US")
+    assert opened.evaluate(ends) == pytest.approx(newtons / 4.4482216152605, rel=1e-3)
+    assert "lbf" in opened.evaluate("drawnPanels[0].chart.axes[1].label")
+    assert errors == []
+    opened.close()
+
+
 @pytest.mark.parametrize("width", [1100, 390])
 def test_a_damper_sheet_keeps_nobody_out(made, tmp_path, width):
     opened = made.new_page(viewport={"width": width, "height": 900})

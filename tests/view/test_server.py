@@ -16,10 +16,13 @@ import yaml
 
 from can_dbc.errors import InputError
 from dart_model.spec import MODELS, load_model
+from rig.bridge.values import Mode
 from rig.formats.run_arrays import open_run
+from rig.log.follower import RunFollower
 from rig.pages.view import visible_stretch as closely
 from rig.pages.view.server import _MOST_CONNECTIONS, HOST, ViewServer
 from tests.view.serving import COUNT, described, get, grown_old, make_run, serving, stretch
+from tests.view.states import make_state
 
 STRUT = "strut"
 
@@ -408,11 +411,37 @@ def test_a_request_for_no_address_is_one_for_nothing(server, capfd):
 
 
 def test_a_load_cell_is_drawn_only_where_it_can_be_one_struts():
-    rows = np.column_stack([np.arange(80.0), *(np.linspace(0.1, 0.9, 80),) * 4])
-    names = ("a.height_m", "a.velocity_m_per_s", "a.force_n", "strut_force_n")
+    modes = np.full(80, float(Mode.RUNNING))
+    modes[70:] = float(Mode.SAFE)  # the model stands still: its motion is not that of the bench
+    rows = np.column_stack([np.arange(80.0), *(np.linspace(0.1, 0.9, 80),) * 4, modes])
+    names = ("a.height_m", "a.velocity_m_per_s", "a.force_n", "strut_force_n", "mode")
     follower = SimpleNamespace(columns=("t_ns", *names))
     alone = closely.planes(follower, rows, "a", with_cell=True)
     beside = closely.planes(follower, rows, "a", with_cell=False)
-    assert len(alone["height_m:measured"][0]) == 80
+    assert len(alone["height_m:measured"][0]) == 70
     assert beside["height_m:measured"] == [[], []]
     assert beside["height_m:estimated"] == alone["height_m:estimated"]
+
+
+def test_last_values_belong_to_one_time(tmp_path):
+    """The force error is that of the force and the load cell beside it, whenever the cell sends."""
+    run = make_state(tmp_path / "running", "running")
+    follower = RunFollower(run)
+    follower.update(100_000)
+    names = ["strut.force_n", "strut_force_n", "force_error_n", "strut.innovation_m"]
+    found = closely.last_values(follower, names, follower.span_s[1])
+    error_n = found["strut.force_n"] - found["strut_force_n"]
+    assert found["force_error_n"] == pytest.approx(error_n, abs=1e-9)
+    assert "strut.innovation_m" in found
+
+
+def test_a_height_error_says_nothing_while_no_height_arrives(tmp_path):
+    run = make_state(tmp_path / "safe_silent", "safe_silent")
+    follower = RunFollower(run)
+    follower.update(100_000)
+    window = follower.window(["mode", "strut.innovation_m"], 0.0, 6.0, 10_000)
+    mode, innovation_m = window.values
+    is_apart = np.isin(mode, [Mode.WAITING, Mode.HOLD, Mode.SAFE])
+    assert np.any(is_apart)
+    assert not np.any(np.isfinite(innovation_m[is_apart]))
+    assert np.all(np.isfinite(innovation_m[mode == Mode.RUNNING]))

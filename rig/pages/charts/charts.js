@@ -82,8 +82,9 @@ const Charts = (() => {
     points: { show: item.points ?? false, size: 4 },
     paths: item.paths,
     value(u, given, index, at) {
-      // Without a cursor the legend holds the last values.
-      const v = given === null && !(u.cursor.left >= 0) ? (u.data[index][lastOf(u.data[index])] ?? null) : given;
+      // Without a cursor the legend holds the last values: those of one time, if they are given.
+      const last = () => (u.latest ? u.latest[index] : u.data[index][lastOf(u.data[index])]) ?? null;
+      const v = given === null && !(u.cursor.left >= 0) ? last() : given;
       return `${number(v)}${item.unit ? ` ${item.unit}` : ""}${difference(u, v, index, at)}`;
     },
   });

@@ -101,7 +101,7 @@ def remainder(diagnosis: Diagnosis) -> Statement:
     above = f"{times(ratio)} times the noise floor" if math.isfinite(ratio) else "floor not known"
     if force.after > _NOTHING_GAINED * force.before:
         text = f"No law reduces it ({above}): the given model is as good as any that was found."
-        return Statement(tone, sign, text)
+        return Statement("idle", "–", text)
     text = f"{share} of the residual force is left ({above}): something is still missing."
     return Statement(tone, sign, text)
 
@@ -247,7 +247,9 @@ def _rivals(diagnosis: Diagnosis) -> Statement:
     tried = [item for item in diagnosis.rejected if item.left is not None]
     if diagnosis.ambiguous_with:
         rivals = join_words([FAMILY_WORDS[item] for item in diagnosis.ambiguous_with], "and")
-        text = f"{capital(rivals)} cannot be distinguished from it in these recordings."
+        text = f"{capital(rivals)} cannot be distinguished from it in these recordings"
+        cure = diagnosis.suggested_excitation
+        text += f". To distinguish them: {cure}." if cure else "."
         return Statement("part", "?", text)
     if diagnosis.verdict == "nothing_missing":
         return Statement("good", "✓", "No law is needed for what these recordings excite.")
@@ -258,9 +260,10 @@ def _rivals(diagnosis: Diagnosis) -> Statement:
             return Statement("good", "✓", "No law reduces the error further.")
         return Statement("bad", "✕", f"None of {len(tried)} laws explains it.")
     nearest = tried[0]
+    tested = "The one rival" if len(tried) == 1 else f"The nearest of {len(tried)} rivals"
     text = (
-        f"No rival of {len(tried)} fits as well; the nearest is {effect(nearest.name).words}, "
-        f"which leaves {percent(nearest.left, 1)} of the linear model's residual."
+        f"{tested}, {effect(nearest.name).words}, leaves {percent(nearest.left, 1)} of the linear "
+        "model's residual."
     )
     return Statement("good", "✓", text)
 

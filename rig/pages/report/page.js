@@ -8,13 +8,19 @@ const drawnPanels = [];
 // Paper is narrower than the window: charts are drawn again at the width of its columns.
 const PAPER = { whole: 690, half: 335, height: 205, low: 165 };
 
-function draw(element, panel) {
-  const x = unpacked(panel.x, Float64Array);
-  const values = panel.values.map((text) => unpacked(text));
+// Values times a factor; those that are missing stay so.
+const scaled = (values, factor) => (factor === 1 ? values : values.map((v) => (v === null ? null : v * factor)));
+
+function draw(element, original) {
+  const [ofX, xLabel] = Units.axis(original.xLabel);
+  const [ofY, yLabel] = Units.axis(original.yLabel);
+  const panel = { ...original, xLabel, yLabel, reach: original.reach && original.reach * ofY, y_range: original.y_range && scaled(original.y_range, ofY) };
+  const x = scaled(unpacked(panel.x, Float64Array), ofX);
+  const values = panel.values.map((text) => (panel.kind === "cells" ? unpacked(text) : scaled(unpacked(text), ofY)));
   const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points" && !curve.is_line, spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
   const [name, unit] = panel.xLabel.split(" / ");
   const spec = { ...panel, series, xName: name, xUnit: unit };
-  if (panel.kind === "cells") return Charts.cells(element, spec, x, unpacked(panel.y), values[0]);
+  if (panel.kind === "cells") return Charts.cells(element, spec, x, scaled(unpacked(panel.y), ofY), values[0]);
   if (panel.kind === "lines") {
     const chart = Charts.lines(element, { ...spec, logX: panel.log, logY: panel.log, rangeY: panel.y_range });
     chart.set([x, ...values]);
@@ -28,8 +34,15 @@ function draw(element, panel) {
 for (const data of document.querySelectorAll("script[data-plot]")) {
   const elements = document.getElementById(data.dataset.plot).querySelectorAll(".chart");
   const half = elements[0].closest(".panels2, .first") !== null;
-  JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, element: elements[i], ...draw(elements[i], panel) }));
+  JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, panel, element: elements[i], ...draw(elements[i], panel) }));
 }
+window.addEventListener("unitschange", () => {
+  for (const drawn of drawnPanels) {
+    drawn.destroy();
+    drawn.element.replaceChildren();
+    Object.assign(drawn, draw(drawn.element, drawn.panel));
+  }
+});
 window.addEventListener("beforeprint", () => {
   for (const folded of document.querySelectorAll("details")) folded.open = true;
   for (const { chart, half, element } of drawnPanels) {

@@ -53,6 +53,7 @@ const Glance = (() => {
   // Values of the second before the end of what is shown; `lists` are the curves of the first run.
   function tiles(latest, mode, t, lists, begin, end) {
     const isApart = APART.includes(mode);
+    const isOld = isApart && latest.measured_age_s > latest.staleAfter_s;
     const figures = {
       "tile-height": [latest.measured_height_m, latest.height_m === undefined ? "" : ["model", latest.height_m]],
       "tile-force": [latest.force_n, latest.force_std_n === undefined ? "" : ["standard deviation", latest.force_std_n]],
@@ -65,6 +66,7 @@ const Glance = (() => {
       const big = value === undefined ? "–" : figure(value);
       let sub = more ? `${more[0]} ${figure(more[1])}` : "";
       if (id === "tile-force" && mode !== "RUNNING") sub = "invalid";
+      if (id === "tile-height" && isOld) sub = `last value, ${Charts.fixed(latest.measured_age_s, 2)} s old`;
       if (id === "tile-force-error") {
         const share = value / latest.load_cell_peak_n;
         const without = latest.withCell ? "" : "no load cell: not known";
@@ -73,7 +75,7 @@ const Glance = (() => {
       if (id === "tile-innovation" && tile.shown.length) sub = `limit ${span(tile.shown)} ${tile.unit}`;
       put(by(id).querySelector(".big"), big);
       put(by(id).querySelector(".sub"), sub);
-      by(id).classList.toggle("invalid", id === "tile-force" && mode !== "RUNNING");
+      by(id).classList.toggle("invalid", (id === "tile-force" && mode !== "RUNNING" && value !== undefined) || (id === "tile-height" && isOld));
       sparks[id].set([t, (lists[tile.column] ?? []).map((v) => (v === null ? null : v * tile.factor))], begin, end);
     }
   }

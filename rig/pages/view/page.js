@@ -165,7 +165,7 @@ function build() {
   for (const quantity of Object.values(planes.motions)) {
     const leastX = unitOf(quantity.unit)[0] * quantity.least_span;
     charts[`plane-${quantity.name}`] = Charts.plane(at(`plane-${quantity.name}`), {
-      xLabel: labelOf(quantity), yLabel: unitOf(planes.force.unit)[1], leastX, leastY: planes.force.least_span, series: [...points, ...laws, ...others],
+      xLabel: labelOf(quantity), yLabel: unitOf(planes.force.unit)[1], leastX, leastY: unitOf(planes.force.unit)[0] * planes.force.least_span, series: [...points, ...laws, ...others],
     });
   }
   const density = unitOf("N/√Hz")[1];
@@ -200,7 +200,8 @@ function draw(found) {
   banners();
   // A long run is read piece by piece: the whole of it is longer the next time.
   if (view.follow && last() > view.end + 1e-6) changed = true;
-  const width = columnsOf(strut).length;
+  const names = columnsOf(strut);
+  const width = names.length;
   const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
   begun = [width, t];
   for (const id of Object.keys(shown)) {
@@ -209,11 +210,13 @@ function draw(found) {
       const list = t[1 + item.run * width + item.column];
       return item.factor === 1 ? list : list.map((v) => (v === null || v === undefined ? null : item.factor * v));
     });
+    const lastOf = (item) => found[item.run].head.last[names[item.column]];
+    charts[id].chart.latest = [null, ...shown[id].map((item) => (lastOf(item) === undefined ? null : lastOf(item) * item.factor))];
     charts[id].set([t[0], ...lists], view.begin, view.end);
   }
   const lists = Object.fromEntries(TABLE.curves.map((curve, i) => [curve.column, has(runs[0], curve) ? first.lists[i] : []]));
   const withCell = runs[0].columns.includes("force_error_n");
-  Glance.tiles({ ...first.head.latest, withCell }, TABLE.band.modes[first.head.latest.mode]?.[0], first.t, lists, view.begin, view.end);
+  Glance.tiles({ ...first.head.latest, withCell, staleAfter_s: runs[0].supervision?.stale_after_s ?? Infinity }, TABLE.band.modes[first.head.latest.mode]?.[0], first.t, lists, view.begin, view.end);
   const steps = found.reduce((sum, item) => sum + item.head.steps, 0);
   at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${Charts.fixed(steps, 0)} ticks`;
   document.body.dataset.end = first.head.span_s[1];

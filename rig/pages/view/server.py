@@ -429,6 +429,7 @@ def _stretch(view: ViewServer, query: _Query) -> Answer:
             "state": run.state()[0],
             "banner": run.banner()._asdict(),
             "latest": visible_stretch.latest(run.follower, query.text("strut"), end_s),
+            "last": visible_stretch.last_values(run.follower, names, end_s),
             "begin_s": begin_s,
             "end_s": end_s,
             "count": len(window.t_s),

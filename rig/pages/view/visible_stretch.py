@@ -12,6 +12,7 @@ from scipy import signal
 from dart_model.effects import AMBIENT_C
 from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
+from rig.bridge.values import Mode
 from rig.channels.measured_quantities import TEMPERATURE
 from rig.log.candump import LATEST_S, parse_frame
 from rig.log.file_names import FRAMES_FILE, parts
@@ -36,6 +37,9 @@ FORCE_STD = "force_std_n"
 
 LONGEST_S = 60.0
 """Length of the end of a stretch that is evaluated; a longer one is cut."""
+
+_FOLLOWING = (Mode.SETTLING, Mode.RUNNING, Mode.READY)
+"""Modes in which the model's motion is that of the bench."""
 
 _ACROSS, _UP = 240, 160
 """Cells of the plane in which points are drawn, one point a cell."""
@@ -62,8 +66,8 @@ def latest(follower: RunFollower, strut: str, end_s: float) -> dict[str, float]:
     """Figures of the second before a time, by name; what was not measured is absent.
 
     Last values of the measured and the model height, of the force and its standard deviation, and
-    of the mode's number; root mean squares of height error and force error, and the load cell's
-    largest force.
+    of the mode's number; the age of the measured height in s; root mean squares of height error and
+    force error, and the load cell's largest force.
     """
     rows = follower.rows(*follower.between(end_s - LATEST_WINDOW_S, end_s))
     rows = rows[(rows[:, 0] > 1e9 * (end_s - LATEST_WINDOW_S)) & (rows[:, 0] <= end_s * 1e9 + 0.5)]
@@ -80,6 +84,9 @@ def latest(follower: RunFollower, strut: str, end_s: float) -> dict[str, float]:
     }
     last["mode"] = finite(MODE_COLUMN)
     found = {name: float(values[-1]) for name, values in last.items() if len(values)}
+    sampled_ns = finite(f"{strut}.measured_t_ns")
+    if len(sampled_ns):
+        found["measured_age_s"] = 1e-9 * float(rows[-1, 0] - sampled_ns[-1])
     for name, column in (
         ("height_error_rms_m", HEIGHT_ERROR_CURVE.column_of(strut)),
         ("force_error_rms_n", FORCE_ERROR),
@@ -89,6 +96,30 @@ def latest(follower: RunFollower, strut: str, end_s: float) -> dict[str, float]:
     if len(values := finite(LOAD_CELL.column)):
         found["load_cell_peak_n"] = float(np.abs(values).max())
     return found
+
+
+def last_values(follower: RunFollower, names: Sequence[str], end_s: float) -> dict[str, float]:
+    """Values of columns that belong together, by name: of one cycle where it has all of them.
+
+    It is the last cycle before a time with a force error, and the last one for columns that have no
+    part in it; what it lacks is absent.
+    """
+    rows = follower.rows(*follower.between(end_s - LATEST_WINDOW_S, end_s))
+    rows = rows[rows[:, 0] <= end_s * 1e9 + 0.5]
+    if not len(rows):
+        return {}
+    compared = np.flatnonzero(np.isfinite(_column(rows, follower.columns, FORCE_ERROR)))
+    with_cell = rows[compared[-1]] if len(compared) else rows[-1]
+    found: dict[str, float] = {}
+    for name in names:
+        is_compared = name in (FORCE_ERROR, LOAD_CELL.column) or name.endswith(_FORCE)
+        row = with_cell if is_compared else rows[-1]
+        if name in follower.columns and np.isfinite(value := row[follower.columns.index(name)]):
+            found[name] = float(value)
+    return found
+
+
+_FORCE = f".{ESTIMATED_FORCE.column}"
 
 
 def csv_of(follower: RunFollower, begin_s: float, end_s: float, names: Sequence[str]) -> str:
@@ -112,6 +143,8 @@ def planes(
     columns = follower.columns
     force = _column(rows, columns, ESTIMATED_FORCE.column_of(strut))
     cell = _column(rows, columns, LOAD_CELL.column_of(strut))
+    follows = np.isin(_column(rows, columns, MODE_COLUMN), _FOLLOWING)
+    force, cell = (np.where(follows, values, np.nan) for values in (force, cell))
     last = _last_cycle(_column(rows, columns, f"{strut}.velocity_m_per_s"))
     points: dict[str, list[list[float]]] = {}
     for name in MOTION_COLUMNS:
