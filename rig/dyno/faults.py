@@ -116,9 +116,9 @@ class NamedFault(NamedTuple):
         low, value, high = sorted(scale * end for end in (size.low, size.value, size.high))
         bound = "at least " if math.isinf(high) else "at most " if math.isinf(low) else ""
         words = (less if is_less else more).format(
-            name=self.name, size=f"{bound}{_two_digits(value)} {unit}"
+            name=self.name, size=f"{bound}{_two_digits(value)}\u00a0{unit}"
         )
-        interval = f" (95 %: {_two_digits(low)} to {_two_digits(high)} {unit})"
+        interval = f" (95\u00a0%: {_two_digits(low)} to {_two_digits(high)}\u00a0{unit})"
         return words if bound else words + interval
 
 

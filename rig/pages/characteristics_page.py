@@ -60,6 +60,7 @@ class PointRow(NamedTuple):
     force: str
     limits: str
     margin: str
+    method: str
 
 
 class PropertyRow(NamedTuple):
@@ -89,12 +90,13 @@ def write_characteristics_page(
         stamp=None if worst is None else _STAMPS[worst],
         findings=[find(report) for report in reports],
         pictures=draw_damper(reports),
-        points=_point_rows(first.points) if len(reports) == 1 else [],
+        points=_urgent_points(first.points) if len(reports) == 1 else [],
         further_points=max(0, len(first.points) - _MOST_POINTS),
         properties=property_rows(first) if len(reports) == 1 else [],
         has_master=first.master is not None,
         signs=SIGNS,
         reports=reports,
+        point_rows=point_rows,
         kinds=KIND_WORDS,
         damper_rows=damper_rows,
         with_half=with_half,
@@ -150,11 +152,16 @@ def _place(point: PointVerdict) -> str:
     return f"{point.side} at {with_unit(f'{point.velocity_m_per_s:.3g}', 'm/s')}"
 
 
-def _point_rows(points: Sequence[PointVerdict]) -> list[PointRow]:
-    """Rows of a band's points by side and speed; the most urgent ones where they are too many."""
+def _urgent_points(points: Sequence[PointVerdict]) -> list[PointRow]:
+    """Rows of as many points as a page has room for, the most urgent ones."""
     by_urgency = sorted(points, key=lambda it: (_ORDER.index(it.verdict), it.margin_n or 0.0))
-    listed = sorted(by_urgency[:_MOST_POINTS], key=lambda it: (it.side, it.velocity_m_per_s))
-    return [_point_row(point) for point in listed]
+    return point_rows(by_urgency[:_MOST_POINTS])
+
+
+def point_rows(points: Sequence[PointVerdict]) -> list[PointRow]:
+    """Rows of a band's points by side and speed."""
+    ordered = sorted(points, key=lambda it: (it.side, it.velocity_m_per_s))
+    return [_point_row(point) for point in ordered]
 
 
 def _point_row(point: PointVerdict) -> PointRow:
@@ -169,6 +176,7 @@ def _point_row(point: PointVerdict) -> PointRow:
         "–" if point.force is None else with_half(point.force),
         f"{number(point.low_n, 0)} to {number(point.high_n, 0)}",
         "–" if margin_n is None else f"{plus}{three_digits(margin_n)}",
+        "no step at this speed" if point.force is None else point.force.method,
     )
 
 

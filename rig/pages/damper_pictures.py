@@ -219,6 +219,7 @@ def _draw_heights(axes: Any, records: Sequence[Characteristics], units: PlotUnit
             displacement = units.displacement[0] * _displacement_m(step, stroke)
             axes.plot(displacement, units.force[0] * stroke.force_n, **style)
             style.pop("label", None)
+    axes.locator_params(axis="x", nbins=5)
     _label_steps(axes, records, _middle_point, units)
     axes.set(
         title="Force over displacement (F-x)",

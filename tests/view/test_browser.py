@@ -288,9 +288,9 @@ def one_point_band():
     [
         ("9 160 ± 910 N", "2 059 ± 205 lbf"),
         ("12.08 N (95 %: 11.83 to 12.36 N)", "2.716 lbf (95 %: 2.659 to 2.779 lbf)"),
-        ("Height error 2.31 → 0.0104 mm", "Height error 0.091 → 0.00041 in"),
+        ("Height error 2.31 → 0.0104 mm", "Height error 0.0909 → 0.000409 in"),
         ("−500 N/m³ and 3 kg", "−500 N/m³ and 3 kg"),
-        ("at 0.5 m/s, 100 N·s/m", "at 20 in/s, 0.57 lbf·s/in"),
+        ("at 0.5 m/s, 100 N·s/m", "at 19.7 in/s, 0.571 lbf·s/in"),
     ],
 )
 def test_quantities_in_a_text_are_converted(made, tmp_path, text, converted):

@@ -17,15 +17,18 @@ const Units = (() => {
     return Charts.fixed(step > 1 ? Math.round(value / step) * step : value, decimals);
   };
 
-  // As many digits in another unit; a value beside ± is rounded as its interval is.
+  // As many digits in another unit, three at least; a value beside ± is rounded as its interval is.
   const convert = (text, factor) => {
-    const more = Math.round(-Math.log10(factor));
+    const more = Math.ceil(-Math.log10(factor));
+    const beside = text.includes("\u00a0±\u00a0");
     const zeros = /±\u00a0[1-9][\d\u202f]*?(0*)$/.exec(text)?.[1].length ?? 0;
     return text.replace(new RegExp(NUMBER, "g"), (found) => {
       const sign = "+±".includes(found[0]) ? found[0] : "";
       const plain = found.replace(/[+±\u202f]/g, "").replace("\u2212", "-");
-      const decimals = plain.includes(".") ? plain.split(".")[1].length : -zeros;
-      return sign + rounded(plain * factor, decimals + more);
+      const decimals = (plain.includes(".") ? plain.split(".")[1].length : -zeros) + more;
+      const value = plain * factor;
+      const enough = beside || value === 0 ? decimals : Math.max(decimals, 2 - Math.floor(Math.log10(Math.abs(value))));
+      return sign + rounded(value, enough);
     });
   };
 
