@@ -208,7 +208,9 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
 
     def deviance(log_ratio: float) -> float:
         squares, logs, count = sums(log_ratio)
-        return count * np.log(max(squares, 1e-300) / count) + logs
+        found = count * np.log(max(squares, 1e-300) / count) + logs
+        # After a long gap near the diffuse start, rounding may make a variance negative.
+        return found if np.isfinite(found) else np.inf
 
     # The smoother's time constant is about (1 / ratio) ** (1 / 7): from less than half a step to
     # more than the whole run.
