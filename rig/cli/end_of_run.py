@@ -75,10 +75,20 @@ def print_end(
 
 
 def diagnosis_of(plan: "Plan", folder: Path, model: str | None = None) -> str:
-    """The command that diagnoses a run, with the model that it used; empty without a force."""
+    """The command that follows a run; empty where no force was measured.
+
+    It diagnoses the run with the model that it used, or evaluates one that is already corrected.
+    """
+    from rig.diagnosis.outcome import DIAGNOSIS_FILE
+
     if not plan.has_force:
         return ""
-    return f"rig diagnose {folder} --model {model or _model_of(plan)} --out found"
+    used = model or _model_of(plan)
+    if (Path(used).parent / DIAGNOSIS_FILE).is_file():
+        return f"rig evaluate {folder} --model {used}"
+    names = ("found", *(f"found_{number}" for number in range(2, 100)))
+    out = next((name for name in names if not Path(name).exists()), names[-1])
+    return f"rig diagnose {folder} --model {used} --out {out}"
 
 
 def _model_of(plan: "Plan") -> str:

@@ -225,7 +225,8 @@ def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> 
         print_text(
             f"Of it, {expectation.by_late_force_n:.3g} N RMS are proportional to the rate of the "
             "applied force, which acts later in the loop than the height. `rig diagnose` "
-            "and `rig evaluate` use the times of the samples and do not contain this part."
+            "and `rig evaluate` use the times of the samples and do not contain this part. A "
+            "shorter cycle of its message reduces it."
         )
     if strut.latency is not None:
         _print_latency(strut.latency, force_cycle_ms, is_set=bool(strut.delay_s))

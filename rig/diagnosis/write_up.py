@@ -62,6 +62,15 @@ _HOLD = 0.3
 _FAR = 3.0
 """Standard deviations from a stated value that one in 370 corrections exceeds by chance."""
 
+_STANDSTILL = 0.02
+"""Share of the speed that is exceeded in a twentieth of the time, below which a strut rests."""
+
+_LEAST_REST = 0.05
+"""Share of the time from which on rests, or motion, are worth a note."""
+
+_MOSTLY = 2.0
+"""Ratio of the remaining forces at standstill and in motion from which on the former decides."""
+
 _AT_BOUND = 1e-3
 """Distance from the end of a range, relative, within which a parameter counts as at it."""
 
@@ -132,7 +141,8 @@ def compose_result(
         _notes(problem, search, by_blocks=by_blocks)
         + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
         + _notes_of_bounds(problem, estimates)
-        + _notes_of_friction_like_laws(problem, chosen, after),
+        + _notes_of_friction_like_laws(problem, chosen, after)
+        + _notes_of_standstill(problem, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
     )
@@ -388,7 +398,7 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
     if len(search.chosen.fit.candidate.new) > 1:
         notes.append(
             "Several effects act together: fewer than 95 % of such intervals contain the true "
-            "value."
+            "value. The diagnosis of another run shows by how much the values differ."
         )
     if any(p.kind == "mass" for p in _free(problem, search.chosen.fit)) and not search.gain_alike:
         notes.append(
@@ -445,6 +455,33 @@ def _notes_of_bounds(problem: Problem, estimates: FitEstimates) -> tuple[str, ..
                     f"({text}): the data may require a value beyond it, and "
                     "its interval is not to be relied on."
                 )
+    return tuple(notes)
+
+
+def _notes_of_standstill(
+    problem: Problem, after: Sequence[ResidualForces | None]
+) -> tuple[str, ...]:
+    """Where the force that remains is that of rests and holds, during which friction creeps."""
+    notes: list[str] = []
+    known = [forces for forces in after if forces is not None]
+    for index, strut in enumerate(problem.spec.struts):
+        if not known:
+            break
+        force_n = np.concatenate([forces.force_n[index] for forces in known])
+        velocity = np.concatenate([f.track.velocities_m_per_s[index] for f in known])
+        is_known = np.isfinite(force_n)
+        speed, force_n = np.abs(velocity[is_known]), force_n[is_known]
+        rests = speed < _STANDSTILL * float(np.quantile(speed, 0.95)) if len(speed) else speed > 0.0
+        if not _LEAST_REST < float(np.mean(rests)) < 1.0 - _LEAST_REST:
+            continue
+        at_rest_n, moving_n = rms(force_n[rests]), rms(force_n[~rests])
+        if at_rest_n > _MOSTLY * moving_n:
+            notes.append(
+                f"The force that remains in strut {strut.name} is {at_rest_n:.3g} N RMS at "
+                f"standstill ({float(np.mean(rests)):.0%} of the time) and {moving_n:.3g} N in "
+                "motion: during rests and holds the way in which friction creeps decides. A "
+                "recording of motion alone evaluates the other laws better."
+            )
     return tuple(notes)
 
 

@@ -6,7 +6,7 @@ signal that marks the estimate as invalid, and limits on what a height sensor ca
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -47,6 +47,9 @@ _VALID_WORDS = ("valid", "vld", "gueltig", "qual", "ok", "healthy")
 _OK_CHOICES = ("ok", "valid", "good", "gueltig", "healthy")
 _WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
+_COUNTER_BITS = range(2, 9)
+"""Bits of a message counter: two (the least that shows a repetition) to eight."""
+
 _COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount", "seq")
 _STATE_WORDS = ("state", "mode", "status", "zustand")
 _ELSEWHERE = -1.0
@@ -353,8 +356,33 @@ def _rate(interval_ns: int | None) -> list[str]:
 
 def _signal_lines(choice: Choice) -> list[str]:
     keys = {"message": choice.message.name, "signal": choice.signal.name}
-    entry = ", ".join(f"{key}: {value}" for key, value in (keys | _frame_checks(choice)).items())
-    return [f"  # {choice.comment}", f"  {choice.quantity.key}: {{{entry}}}"]
+    checks = _frame_checks(choice)
+    entry = ", ".join(f"{key}: {value}" for key, value in (keys | checks).items())
+    hints = _hints_at_checks(choice, checks)
+    return [f"  # {choice.comment}", *hints, f"  {choice.quantity.key}: {{{entry}}}"]
+
+
+def _hints_at_checks(choice: Choice, found: Mapping[str, str]) -> list[str]:
+    """Comments on what of a message may state its validity and count its frames, if not found."""
+    small = [
+        item
+        for item in choice.message.signals.values()
+        if not item.unit and not item.is_float and item.name != choice.signal.name
+    ]
+    bits = [item.name for item in small if item.length_bits == 1]
+    counters = [item.name for item in small if item.length_bits in _COUNTER_BITS]
+    hints: list[str] = []
+    if "valid" not in found and bits:
+        hints.append(
+            f"  # if a bit marks it as valid, add: valid: {{signal: {bits[0]}, value: 1}}"
+            + (f"; or {', '.join(bits[1:])}" if bits[1:] else "")
+        )
+    if "counter" not in found and counters and choice.message.protection is None:
+        hints.append(
+            f"  # if a signal counts its frames, add: counter: {counters[0]}"
+            + (f"; or {', '.join(counters[1:])}" if counters[1:] else "")
+        )
+    return hints
 
 
 def _frame_checks(choice: Choice) -> dict[str, str]:
@@ -435,7 +463,13 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
     free = [item for item in messages if item.sender != bench] or messages
     estimates = [item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.is_likely]
     if not estimates:
-        return _lines_of_own_message(database)
+        forces = [
+            f"{item.name} ({signal.name})"
+            for item in free
+            for signal in item.signals.values()
+            if item.sender != bench and measures(signal, Dimension.FORCE)
+        ]
+        return [*_hint_at_messages(forces), *_lines_of_own_message(database)]
     best = estimates[0]
     lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
     # Validity and mode may have another message, but never one that another node sends.
@@ -462,6 +496,16 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
         entry = f"{{message: {state[0].name}, signal: {state[1].name}}}"
         lines += ["status:", f"  state: {entry}"]
     return lines
+
+
+def _hint_at_messages(forces: Sequence[str]) -> list[str]:
+    """A comment that names messages which may carry the estimate."""
+    if not forces:
+        return []
+    return [
+        "# A force in a message that the sender of the height does not send may be meant for the",
+        f"# estimate: {', '.join(forces[:_MOST_OTHERS])}. If so, use it below.",
+    ]
 
 
 def _lines_of_own_message(database: Database) -> list[str]:

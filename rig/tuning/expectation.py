@@ -179,7 +179,7 @@ def expectation_from_run(
     stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
     noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
     by_late_n = part_by_late_force(stretch, force_n)
-    source = f"{folder}, {np.ptp(stretch.tick_s):.3g} s in RUNNING"
+    source = f"{folder}, its longest stretch in RUNNING, {np.ptp(stretch.tick_s):.3g} s"
     return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), source, by_late_n)
 
 
