@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -12,10 +13,12 @@ import yaml
 from dart_model.spec import MODELS
 from rig.bridge.counts import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
+from rig.cli.end_of_run import diagnosis_of
 from rig.cli.main import app, main
 from rig.cli.progress import status_line
 from rig.cli.terminal import console, table
 from rig.plan.config import CONFIGS
+from rig.plan.load import load_plan
 from rig.run.loop import Look
 from tests.view.serving import make_run
 
@@ -138,6 +141,18 @@ def test_a_replay_as_json(monkeypatch, capsys, tmp_path):
 def test_a_file_of_another_kind_is_named(monkeypatch, capsys, given, says):
     assert rig(monkeypatch, *given) == 2
     assert says in capsys.readouterr().err
+
+
+def test_the_next_command_after_a_run_can_be_typed(monkeypatch, tmp_path):
+    """Results go into a folder that is free; a corrected model is evaluated."""
+    monkeypatch.chdir(tmp_path)
+    plan, run = load_plan(CONFIGS / "reference.yaml"), Path("run1")
+    assert diagnosis_of(plan, run) == "rig diagnose run1 --model reference --out found"
+    (tmp_path / "found").mkdir()
+    assert diagnosis_of(plan, run).endswith("--out found_2")
+    (tmp_path / "found" / "diagnosis.json").write_text("{}")
+    following = diagnosis_of(plan, run, "found/corrected.yaml")
+    assert following == "rig evaluate run1 --model found/corrected.yaml"
 
 
 def test_no_name_is_cut_in_a_table(capsys):

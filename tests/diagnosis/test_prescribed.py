@@ -184,6 +184,22 @@ def test_a_parameter_at_the_end_of_its_range_is_noted():
     assert not any("lower end" in note for note in notes)
 
 
+class Creep(Nothing):
+    """A force at standstill that no law follows."""
+
+    def force(self, t, z, v, state, warm):
+        return 12.0 * math.sin(1.3 * t * t) * math.exp(-((v / 2e-3) ** 2))
+
+
+def test_a_force_that_remains_at_standstill_is_noted():
+    runs = [dyno.run(Creep(), motion=dyno.resting), dyno.run(Creep(), seed=2, motion=dyno.resting)]
+    notes = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis.notes
+    assert any("at standstill" in note and "recording of motion alone" in note for note in notes)
+    moving = [dyno.run(Friction()), dyno.run(Friction(), seed=2)]
+    notes = diagnose(dyno.model(), moving[:1], moving[1:]).diagnosis.notes
+    assert not any("standstill" in note for note in notes)
+
+
 class FrictionAndHardening(Nothing):
     def force(self, t, z, v, state, warm):
         friction = -60.0 * v / math.sqrt(v * v + 4e-6)

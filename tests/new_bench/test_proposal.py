@@ -275,3 +275,28 @@ def test_the_mode_is_not_published_in_a_message_of_another_node(dbc):
     text = DBC.replace("BU_: SENSOR CONTROL", "BU_: SENSOR CONTROL PLC")
     dbc.write_text(text.replace("BA_DEF_ BO_", other, 1))
     assert "status" not in yaml.safe_load(propose(dbc))
+
+
+FOREIGN = """BO_ 705 AFS_Hoogte: 6 SENSOR
+ SG_ AFS_HgtTel : 7|4@0+ (1,0) [0|15] "" CONTROL
+ SG_ AFS_HgtGld : 2|1@0+ (1,0) [0|1] "" CONTROL
+ SG_ AFS_LampAan : 1|1@0+ (1,0) [0|1] "" CONTROL
+ SG_ AFS_Height : 15|20@0- (0.01,0) [-5242.88|5242.87] "mm" CONTROL
+
+BO_ 1248 GST_Schatting: 4 CONTROL
+ SG_ GST_PootKr : 0|16@1- (0.05,0) [-1638.4|1638.35] "daN" SENSOR
+
+"""
+
+
+def test_what_names_of_another_language_may_mean_is_left_to_the_user(dbc):
+    """Bits and counters of the message are named with what to write, and forces of other nodes."""
+    dbc.write_text(HEADER + FOREIGN + CYCLES + 'BA_ "GenMsgCycleTime" BO_ 705 4;\n')
+    text = propose(dbc)
+    assert "add: valid: {signal: AFS_HgtGld, value: 1}; or AFS_LampAan" in text
+    assert "add: counter: AFS_HgtTel" in text
+    assert "GST_Schatting (GST_PootKr). If so, use it below." in text
+    assert yaml.safe_load(text)["signals"]["height"] == {
+        "message": "AFS_Hoogte",
+        "signal": "AFS_Height",
+    }
