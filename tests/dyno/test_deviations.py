@@ -97,10 +97,12 @@ def test_the_command_names_it(tmp_path):
     assert "seal friction" in " ".join(ended.output.split())
     found = json.loads((out / "characteristics.json").read_text())["records"][0]["against_master"]
     assert found["named"][0]["name"] == "seal friction"
-    assert "seal friction" in (out / "report.html").read_text()
+    assert "Seal friction" in (out / "report.html").read_text()
     assert 'failures="1"' in junit.read_text()
-    ended = CliRunner().invoke(app, ["characterise", str(good), "--master", str(good)])
-    assert ended.exit_code == 0
+    again = tmp_path / "again.csv"
+    written(again, (*record(Damper(), np.random.default_rng(3)),))
+    ended = CliRunner().invoke(app, ["characterise", str(again), "--master", str(good)])
+    assert ended.exit_code == 0, ended.output
 
 
 def test_a_master_of_another_test_is_refused():

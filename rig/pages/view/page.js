@@ -2,7 +2,8 @@
 // The page requests the visible stretch, draws it, and requests again: a slow page only draws less
 // often. All data come from the server; the page keeps only the data on the screen.
 
-const FRAME_MS = 48;
+const FRAME_MS = 80;
+const SLOWLY_MS = 240; // tiles, modes and faults: nobody reads them faster
 const CLOSELY_MS = 1000;
 const RUNS_MS = 1000;
 const HIDDEN_MS = 1000;
@@ -23,7 +24,7 @@ let units = Arrange.kept("units") ?? "SI";
 // `follow`: the end is the newest cycle. `span` is a length in s, or null for the whole run.
 const view = { begin: 0, end: 10, span: 10, follow: true };
 let changed = true;
-let drawnAt = 0;
+let drawnAt = -Infinity; // when tiles and modes were drawn
 let evaluatedKey = "";
 let begun = []; // what was drawn last: columns of the chart that is exported
 
@@ -204,8 +205,10 @@ function draw(found) {
   const width = names.length;
   const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
   begun = [width, t];
-  for (const id of Object.keys(shown)) {
-    if (!isSeen(id)) continue;
+  const isSlow = !isFollowing() || first.head.state !== "live" || performance.now() - drawnAt >= SLOWLY_MS;
+  if (isSlow) drawnAt = performance.now();
+  // All are asked before the first is drawn: an answer after a change has the page laid out again.
+  for (const id of Object.keys(shown).filter((id) => (isSlow || id !== "band") && isSeen(id))) {
     const lists = shown[id].map((item) => {
       const list = t[1 + item.run * width + item.column];
       return item.factor === 1 ? list : list.map((v) => (v === null || v === undefined ? null : item.factor * v));
@@ -214,13 +217,18 @@ function draw(found) {
     charts[id].chart.latest = [null, ...shown[id].map((item) => (lastOf(item) === undefined ? null : lastOf(item) * item.factor))];
     charts[id].set([t[0], ...lists], view.begin, view.end);
   }
-  const lists = Object.fromEntries(TABLE.curves.map((curve, i) => [curve.column, has(runs[0], curve) ? first.lists[i] : []]));
-  const withCell = runs[0].columns.includes("force_error_n");
-  Glance.tiles({ ...first.head.latest, withCell, staleAfter_s: runs[0].supervision?.stale_after_s ?? Infinity }, TABLE.band.modes[first.head.latest.mode]?.[0], first.t, lists, view.begin, view.end);
+  if (isSlow) tiles(first);
   const steps = found.reduce((sum, item) => sum + item.head.steps, 0);
   at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${Charts.fixed(steps, 0)} ticks`;
   document.body.dataset.end = first.head.span_s[1];
   document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
+}
+
+function tiles({ head, t, lists }) {
+  const curves = Object.fromEntries(TABLE.curves.map((curve, i) => [curve.column, has(runs[0], curve) ? lists[i] : []]));
+  const withCell = runs[0].columns.includes("force_error_n");
+  const staleAfter_s = runs[0].supervision?.stale_after_s ?? Infinity;
+  Glance.tiles({ ...head.latest, withCell, staleAfter_s }, TABLE.band.modes[head.latest.mode]?.[0], t, curves, view.begin, view.end);
 }
 
 function banners() {
