@@ -343,6 +343,13 @@ def test_notes_are_shown_as_they_are() -> None:
     assert f"Notes {note}" in text
 
 
+def test_the_picture_of_an_ambiguous_result_is_one_law_among_others() -> None:
+    text = " ".join(shown(report(found(ambiguous_with=("friction", "stop")))).split())
+    said = "The correction is that of the law named first; friction or an end stop describes"
+    assert said in text
+    assert "named first" not in shown(report())
+
+
 def test_held_out_blocks_are_named_as_such() -> None:
     diagnosis = found()
     blocks = replace(diagnosis, held_out=replace(diagnosis.held_out, source="blocks"))
@@ -417,9 +424,9 @@ def test_a_file_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None
         write_report(report(), tmp_path / "absent" / "report.html")
 
 
-def test_ten_minutes_at_1_khz_stay_below_2_mb() -> None:
+def test_ten_minutes_at_1_khz_stay_below_1_5_mb() -> None:
     text = page(report(fitted=(fitted(600_000),), held_out=(held_out(600_000),)))
-    assert len(text.encode("utf-8")) < 2_000_000
+    assert len(text.encode("utf-8")) < 1_500_000
 
 
 @pytest.mark.parametrize(

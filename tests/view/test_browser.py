@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import signal
@@ -18,6 +19,7 @@ import yaml
 from rig.dyno.faults import MasterComparison
 from rig.dyno.report import DamperReport
 from rig.dyno.tolerance import BandPoint, ToleranceBand, evaluate_band
+from rig.log.file_names import EVENTS_FILE, STEPS_FILE
 from rig.log.reader import read_run
 from rig.pages.browser_print import print_page
 from rig.pages.characteristics_page import write_characteristics_page
@@ -395,6 +397,31 @@ def test_the_banner_states_mode_cause_and_action(made, states, name):
             assert box["y"] + box["height"] <= 1000
         force = opened.locator("#tile-force .sub").inner_text()
         assert (force == "invalid") == (name != "running")
+
+
+@pytest.mark.long
+def test_the_banner_changes_within_a_second_of_the_mode(made, states, tmp_path):
+    """Real time: from the write of the steps to the word on the page."""
+    whole = states["safe_silent"]
+    run = shutil.copytree(whole, tmp_path / "growing")
+    size = (run / STEPS_FILE).stat().st_size
+    os.truncate(run / STEPS_FILE, size // 2)
+    events = (run / EVENTS_FILE).read_text().splitlines(keepends=True)
+    before = [line for line in events if json.loads(line)["t_s"] < 3.0]
+    (run / EVENTS_FILE).write_text("".join(before))
+    with serving(run) as one, page(made, one) as opened:
+        shown_live(opened, run)
+        assert opened.locator(".banner .word").inner_text() == "RUNNING"
+        with (run / EVENTS_FILE).open("a") as file:
+            file.writelines(events[len(before) :])
+        begin = time.monotonic()
+        with (run / STEPS_FILE).open("ab") as file:
+            file.write((whole / STEPS_FILE).read_bytes()[size // 2 :])
+        opened.locator(".banner .word", has_text="SAFE").wait_for()
+        took_s = time.monotonic() - begin
+        assert "no valid measurement for 501" in opened.locator(".banner .text").inner_text()
+        print(f"banner after {took_s:.2f} s")
+        assert took_s < 1.0
 
 
 def test_tiles_hold_what_the_log_holds(made, states):

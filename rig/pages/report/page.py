@@ -26,7 +26,7 @@ from rig.pages.report.figures import (
 )
 from rig.pages.report.finding import find
 from rig.pages.report.series import check_series
-from rig.pages.report.words import BLOCKS, is_prescribed, sentence
+from rig.pages.report.words import BLOCKS, is_prescribed, join_words, sentence
 
 _POINTS = 4000
 _POINTS_OF_ALL = 24_000
@@ -127,7 +127,15 @@ def _finding_plot(result: Result) -> Plot | None:
         for strut, series in by_strut.items()
     }
     most = by_strut[max(lacking, key=lacking.__getitem__)]
-    return finding_plot("first", most, _POINTS, corrected=_has_corrections(result.diagnosis))
+    diagnosis = result.diagnosis
+    drawn = finding_plot("first", most, _POINTS, corrected=_has_corrections(diagnosis))
+    if drawn is None or not diagnosis.ambiguous_with:
+        return drawn
+    rivals = join_words([FAMILY_WORDS[family] for family in diagnosis.ambiguous_with], "or")
+    return drawn._replace(
+        caption=f"{drawn.caption} The correction is that of the law named first; {rivals} "
+        "describes these recordings as well."
+    )
 
 
 def _corrected_text(result: Result) -> str:
