@@ -41,6 +41,7 @@ def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
     print_text(sentence(diagnosis, struts))
     _print_linear(diagnosis, struts=struts)
     _print_effects(diagnosis, struts=struts)
+    _print_damper(diagnosis, struts=struts)
     _print_held_out(diagnosis)
     for note in diagnosis.notes:
         print_text(f"- {note}")
@@ -83,6 +84,17 @@ def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
     for law, note, parameters in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in parameters]
         print_text(f"- {law.name}, {'; '.join((note, *values))}")
+
+
+def _print_damper(diagnosis: "Diagnosis", *, struts: int) -> None:
+    from rig.pages.report.tables import damper
+
+    if rows := damper(diagnosis):
+        heads = ("at", "force", "95 % interval", "slope")
+        named = [
+            (f"{at} ({strut})" if struts > 1 else at, *cells[:3]) for strut, at, *cells in rows
+        ]
+        print_table(heads, named, "Corrected damper, without spring, friction and stops")
 
 
 def _print_held_out(diagnosis: "Diagnosis") -> None:

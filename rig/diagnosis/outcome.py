@@ -113,6 +113,23 @@ class RejectedEffect:
 
 
 @dataclass(frozen=True)
+class DamperForce:
+    """Force of a corrected strut's damper at a velocity, without spring, friction and stops.
+
+    Attributes:
+        strut: Strut that it belongs to.
+        velocity_m_per_s: Velocity; positive is rebound.
+        force_n: Linear damping and laws of the damper, at mid-stroke; negative in rebound.
+        damping_n_s_per_m: Slope there: decrease of the force over velocity.
+    """
+
+    strut: str
+    velocity_m_per_s: float
+    force_n: Estimate
+    damping_n_s_per_m: Estimate
+
+
+@dataclass(frozen=True)
 class BeforeAfter:
     """A figure of the nominal model, and of the corrected model."""
 
@@ -194,6 +211,7 @@ class Diagnosis:
         notes: Whole sentences: what the data cannot distinguish, what was removed.
         runs: Names of the recordings that were learnt from.
         model: Name of the nominal model.
+        damper: Forces of the dampers that laws describe, by velocity; empty without such a law.
     """
 
     verdict: Verdict
@@ -209,6 +227,7 @@ class Diagnosis:
     notes: tuple[str, ...]
     runs: tuple[str, ...]
     model: str
+    damper: tuple[DamperForce, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
+from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
     Diagnosis,
@@ -145,6 +146,7 @@ def compose_result(
         + _notes_of_standstill(problem, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
+        damper_forces(problem, chosen, estimates.covariance, after),
     )
     models = search.given.model, chosen.model
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)

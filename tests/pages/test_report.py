@@ -15,6 +15,7 @@ from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.outcome import (
     BeforeAfter,
+    DamperForce,
     Diagnosis,
     Estimate,
     ExistingEffect,
@@ -348,6 +349,14 @@ def test_the_picture_of_an_ambiguous_result_is_one_law_among_others() -> None:
     said = "The correction is that of the law named first; friction or an end stop describes"
     assert said in text
     assert "named first" not in shown(report())
+
+
+def test_a_damper_is_stated_in_figures() -> None:
+    figures = DamperForce("s", -0.3, Estimate(31.2, 30.1, 32.3), Estimate(60.4, 58.9, 61.9))
+    text = shown(report(replace(found(), damper=(figures,))))
+    for part in ("Compression 0.3 m/s", "31.2 N", "30.1 to 32.3 N", "60.4 N·s/m"):
+        assert part in text
+    assert "Damper of the corrected model" not in shown(report())
 
 
 def test_held_out_blocks_are_named_as_such() -> None:

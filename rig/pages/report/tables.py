@@ -13,6 +13,7 @@ from rig.pages.number_formats import (
     quantity,
     ratio,
     value_and_interval,
+    with_unit,
 )
 from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
 
@@ -126,6 +127,23 @@ def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
         )
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))
     return tuple(tables)
+
+
+def damper(diagnosis: Diagnosis) -> tuple[Row, ...]:
+    """Strut, velocity, force and its interval, damping and its interval, for each velocity."""
+    rows: list[Row] = []
+    for item in diagnosis.damper:
+        direction = "rebound" if item.velocity_m_per_s > 0.0 else "compression"
+        # A round speed, which has no digits to spare.
+        speed = f"{direction} {with_unit(f'{abs(item.velocity_m_per_s):g}', 'm/s')}"
+        force = value_and_interval(item.force_n, "N")
+        rows.append(
+            (item.strut, speed, *force, *value_and_interval(item.damping_n_s_per_m, _SLOPE))
+        )
+    return tuple(rows)
+
+
+_SLOPE = LINEAR["damping_n_s_per_m"][1]
 
 
 def existing(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
