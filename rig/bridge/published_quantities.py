@@ -125,8 +125,9 @@ COUNTER = Publication(
     Dimension.NUMBER,
     lambda report, _: report.number,
     "COUNTER",
-    "frames of this message that were sent before, from the lower to the upper end of the signal's "
-    "range and again; for a message without E2E protection, which has its own counter",
+    "number of frames of this message that were sent before; after the upper end of the signal's "
+    "range it starts again at the lower one. Only for a message without E2E protection (E2E has a "
+    "counter)",
     wraps_at_range=True,
 )
 STRUT = (*ESTIMATE, *KINEMATICS, *UNCERTAINTY, COUNTER)
@@ -188,8 +189,8 @@ STATUS = (
     ),
     _status(
         "first_cause",
-        f"cause of the last loss of the estimate: {_CAUSES}; 0 while the estimate is valid, or "
-        "before the first loss",
+        f"cause of the first HOLD or SAFE since the estimate was last valid: {_CAUSES}; 0 if there "
+        "was none since then",
         lambda report: report.output.first_cause,
     ),
     _status(

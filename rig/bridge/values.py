@@ -83,7 +83,8 @@ class StepOutput(Struct, frozen=True, gc=False):
 
     Attributes:
         left_out: Channels of further sensors that are not used now.
-        first_cause: Number of what the estimate was lost to; 0 while it is valid, or never was.
+        first_cause: Number of the cause of the first HOLD or SAFE since the estimate was last
+            valid; 0 if there was none since then.
     """
 
     mode: Mode

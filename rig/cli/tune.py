@@ -316,7 +316,8 @@ def _print_errors(strut: "TunedStrut") -> None:
     if tuned_n > _HARDLY * configured_n:
         print_text(
             f"Tuning hardly helps: {tuned_n:.3g} N expected instead of {configured_n:.3g} N. A "
-            "faster or less noisy height, or a model that lacks less, reduces the error further."
+            "height that is sampled more often or with less noise, or a model that lacks less, "
+            "reduces the error further."
         )
     residual_n = float(strut.expectation.power_n2.sum()) ** 0.5
     if tuned_n > residual_n:

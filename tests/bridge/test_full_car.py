@@ -93,6 +93,7 @@ def error_alone(index, mass_kg, *, corrected, share):
     return float(missed / np.std(forces_n[LATER, place]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corrected", [False, True])
 def test_each_strut_of_a_full_car_is_estimated_as_if_it_stood_alone(tmp_path, corrected):
     """Suspensions a third too weak and without their cubic spring; or corrected, as they are."""

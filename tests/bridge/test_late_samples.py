@@ -63,6 +63,7 @@ def settled_n():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [2, 8, 20, 200])
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_no_valid_force_is_far_from_the_truth(name, held, settled_n):

@@ -267,6 +267,7 @@ def worst_valid_errors(seed, kind):
 KINDS = ("PI", "damped PI", "noise-aware")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_valid_errs_at_most_three_times_as_much_as_a_settled_run(kind):
     every = (worst_valid_errors(seed, kind) for seed in range(60))

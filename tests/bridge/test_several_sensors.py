@@ -164,6 +164,7 @@ def test_a_further_sensor_makes_the_force_better_and_its_interval_honest(channel
     assert not any(output.left_out for output in outputs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [CELL, TACHO])
 def test_a_late_sensor_is_held_against_the_model_of_its_time(channel):
     late = sensor(channel.name, channel.quantity, channel.noise_std, MS, 5 * MS)

@@ -233,6 +233,7 @@ def mutate(content: bytes, rng: random.Random) -> bytes:
     return bytes(mutated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_mutated_files_load_or_are_refused(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)

@@ -101,6 +101,7 @@ def test_one_name_twice_and_a_folder_that_is_full_are_refused(two, tmp_path):
     assert not (tmp_path / "full" / "left").exists()
 
 
+@pytest.mark.slow
 def test_no_bridge_imports_a_module_of_the_working_directory(foreign_modules):
     for name in ("left", "right"):
         (foreign_modules.folder / f"{name}.yaml").write_text("rate_hz: none")

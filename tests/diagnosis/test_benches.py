@@ -133,6 +133,7 @@ def test_the_little_dyno():
         assert dart_n == pytest.approx(force_n, abs=0.051)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("later", [False, True])
 def test_the_trailing_arm(later, tmp_path):
     arm = TrailingArm()
@@ -141,6 +142,7 @@ def test_the_trailing_arm(later, tmp_path):
     assert_moves_alike(arm.model(tmp_path), t_s, heights_m, load_n, step_s=5e-4)
 
 
+@pytest.mark.slow
 def test_the_trailing_arm_with_a_stop(tmp_path):
     arm = ArmWithStop()
     t_s, heights_m = arm.heights(1.6)

@@ -54,6 +54,7 @@ def test_every_criterion_has_an_absurd_value():
     assert absurd == {field.name for field in fields(CRITERIA)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", sorted({case for _, _, case in ABSURD}))
 def test_the_usual_criteria_give_the_right_answer(case):
     assert usual(case) == CASES[case].right
@@ -85,6 +86,7 @@ def test_without_a_beam_no_pair_is_looked_for():
     assert max(model.size for model in explored(replace(CRITERIA, beam=0)).fits.values()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("absurd", "worth"), [({}, False), ({"imitation": 1e9}, True), ({"formula": 0.0}, True)]
 )
@@ -106,6 +108,7 @@ def test_a_pair_that_is_but_a_better_formula_for_one_law_is_not_worth_it(absurd,
     assert pool.prefers(leaving(pair, 1e-3 * nearly.excess), nearly)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("one", "other", "worth"),
     [

@@ -52,6 +52,7 @@ def test_what_pieces_show_is_found_and_fitted_to_all(effect, family, parameter, 
     assert holds(named(found, family).parameters[parameter], truth, 0.01)
 
 
+@pytest.mark.slow
 def test_what_no_piece_shows_is_searched_for_in_all():
     runs = [
         bench.run(DeepStop(), load=pushed_n, **LONG),

@@ -302,6 +302,7 @@ def test_a_bump_stop_is_a_rebound_stop_in_the_mirror(case):
     assert rebound["contact_height_m"].value == pytest.approx(contact_m, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_compression_and_rebound_change_places_in_the_mirror():
     case = "weightless asymmetry"
     one, other = answer(case), in_the_mirror(case)

@@ -95,6 +95,7 @@ def counted(notes):
     return [int(number) for number in re.findall(r"\b\d+\b", said)]
 
 
+@pytest.mark.slow
 def test_outliers_change_nothing_and_are_counted():
     clean, test = bench.run(Friction()), bench.run(Friction(), seed=2, duration_s=6.0)
     train, count = with_outliers(clean)
@@ -119,6 +120,7 @@ def test_outliers_of_a_complete_bench_are_no_effect():
     assert any(number >= count - 1 for number in counted(found.notes))
 
 
+@pytest.mark.slow
 def test_a_model_that_fails_on_held_out_data_does_not_lack_nothing():
     def quiet_n(t):
         return 0.2 * bench.load_n(t)

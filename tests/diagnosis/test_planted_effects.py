@@ -250,6 +250,7 @@ class GainAndPreload(Nothing):
         return 8.0
 
 
+@pytest.mark.slow
 def test_a_gain_beside_a_preload_is_found_as_one():
     runs = [bench.run(GainAndPreload()), bench.run(GainAndPreload(), seed=2)]
     found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
@@ -340,6 +341,7 @@ def test_missing_samples_and_uneven_times_change_nothing():
     assert found.effects[0].parameters["stiffness_n_per_m"].value == pytest.approx(200.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_correction_beyond_the_stated_tolerance_is_noted():
     runs = [bench.run(Nothing()), bench.run(Nothing(), seed=2)]
     given = bench.model(stiffness=1.05 * bench.STIFFNESS)

@@ -191,6 +191,7 @@ class Creep(Nothing):
         return 12.0 * math.sin(1.3 * t * t) * math.exp(-((v / 2e-3) ** 2))
 
 
+@pytest.mark.slow
 def test_a_force_that_remains_at_standstill_is_noted():
     runs = [dyno.run(Creep(), motion=dyno.resting), dyno.run(Creep(), seed=2, motion=dyno.resting)]
     notes = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis.notes
@@ -206,6 +207,7 @@ class FrictionAndHardening(Nothing):
         return friction + Hardening().force(t, z, v, state, warm)
 
 
+@pytest.mark.slow
 def test_friction_beside_a_hardening_spring_is_found_as_two():
     runs = [dyno.run(FrictionAndHardening()), dyno.run(FrictionAndHardening(), seed=2)]
     found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis

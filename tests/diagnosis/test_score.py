@@ -59,6 +59,7 @@ def test_friction_and_valves_begin_where_the_motion_shows_both():
         assert shown == pytest.approx(true, abs=0.1 * 0.4 * little_bench.DAMPING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("absurd", "is_named"), [({}, True), ({"dry": 1e9}, False), ({"slow": 0.0}, False)]
 )

@@ -38,11 +38,11 @@ is named there is counted apart."""
 TEXT = f"""
 Recordings are simulated on benches with known truth, by a generator with its own equations of
 motion. In each case no effect, one effect or several effects are planted, on a bench or a dyno. The
-RMS force of each planted effect is at least five times (in `outside` ten times) that which sensor
-noise alone feigns below 25 Hz. The nominal model is exact (apart from these effects) or rough: its
-stiffness is wrong by up to 20 %, its damping by up to 40 %, its mass by up to 5 %, the measured
-applied force by up to 2 %, and a preload of up to 5 % of the weight (on a dyno, of the strut force)
-is missing.
+RMS force of each planted effect is at least five times (in `outside` ten times) the apparent RMS
+force that sensor noise alone causes below 25 Hz. The nominal model is exact (apart from these
+effects) or rough: its stiffness is wrong by up to 20 %, its damping by up to 40 %, its mass by up
+to 5 %, the measured applied force by up to 2 %, and a preload of up to 5 % of the weight (on a
+dyno, of the strut force) is missing.
 
 `single`, `pair` and `triple` are groups with one, two and three planted effects; `complete` has
 none. In `foreign`, the planted force has a formula that `rig` does not contain; in `outside`, none
@@ -71,11 +71,12 @@ A case counts as right if
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
 *False names* is the share of cases in which a family is named that was not planted, with at least
-one identifiable parameter; *not bound* is the share of cases in which the data do not exclude that
-a named effect has the size zero. Each share is given with its 95 % Wilson interval. The intervals
-of parameters are counted only in cases that are right. A case has several of them; the Wilson
-interval of their share assumes that they are independent, and is too narrow. The durations depend
-on the load of the machine, which is stated at the end of the page.
+one identifiable parameter (linear corrections, such as another stiffness, do not count); *not
+bound* is the share of cases in which the data do not exclude that a named effect has the size zero.
+Each share is given with its 95 % Wilson interval. The intervals of parameters are counted only in
+cases that are right. A case may have several of them; the Wilson interval of their share assumes
+that they are independent, and may be too narrow. The durations depend on the load of the machine,
+which is stated at the end of the page.
 """
 
 

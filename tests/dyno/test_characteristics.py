@@ -369,6 +369,7 @@ def test_a_speed_that_is_constant_has_its_force_at_mid_stroke():
     assert any("single speed" in note for note in tested.damper.notes)
 
 
+@pytest.mark.slow
 def test_a_slow_stroke_is_no_rest():
     rest = np.full(1000, 0.0)
     slow, fast = (sine(f, s) for f, s in ((0.004, 625.0), (2.4, 4.0)))

@@ -43,6 +43,7 @@ def state(seed, **changed):
     return characterise_record(ForceRecord(f"state{seed}", *columns(seed, **changed)))
 
 
+@pytest.mark.slow
 def test_a_damper_does_not_differ_from_itself():
     """One comparison in twenty may claim anything at all: three of ten come once in a hundred."""
     claims = [
@@ -192,6 +193,7 @@ def test_a_wrong_band_is_one_line(tmp_path, name, text, says):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_the_compare_command(tmp_path):
     files = [
         str(written(tmp_path / f"{gas}.csv", columns(gas, gas_n=float(gas))))

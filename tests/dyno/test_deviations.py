@@ -39,6 +39,7 @@ def test_a_fault_is_named(fault):
     assert short([item.name for item in naming.named], naming.is_good) == fault
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "name", "size"),
     [

@@ -307,13 +307,14 @@ def test_stuck_value(row):
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(stuck)))
     assert ticks[-1].mode is Mode.SAFE
     assert ticks[-1].counts.implausible > 0
+    invalid_ms = first_ms(ticks, lambda tick: not tick.is_valid)
     hold_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
     safe_ms = first_ms(ticks, lambda tick: tick.mode is Mode.SAFE)
     row(
         11,
         "stuck value: the same height in valid frames (limit `unchanged_s: 0.02`)",
-        f"refuses the measurement; estimate invalid after {hold_ms:.0f} ms (HOLD), "
-        "then the safe state",
+        f"estimate invalid after {invalid_ms:.0f} ms, HOLD after {hold_ms:.0f} ms; refuses the "
+        "measurement once it has been the same for 20 ms; then the safe state",
         safe_ms,
         "the refused measurements",
     )
@@ -322,15 +323,16 @@ def test_stuck_value(row):
 def test_dead_bench(row):
     trial = Trial()
     ticks = trial.run(END_MS, after(BEGIN_NS, lambda _t_ns, _frames: []))
+    invalid_ms = first_ms(ticks, lambda tick: not tick.is_valid)
     hold_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
-    assert hold_ms <= 11
+    assert invalid_ms <= hold_ms <= 11
     assert ticks[-1].mode is Mode.SAFE
     assert ticks[-1].force_n == 0.0
     row(
         12,
         "the bench stops sending",
-        f"estimate invalid after {hold_ms:.0f} ms (HOLD), then the safe state: force 0, invalid, "
-        "until acknowledged",
+        f"estimate invalid after {invalid_ms:.0f} ms, HOLD after {hold_ms:.0f} ms, then the safe "
+        "state: force 0, invalid, until acknowledged",
         first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),
         NOTHING_RECEIVED,
     )

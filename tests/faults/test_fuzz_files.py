@@ -177,6 +177,7 @@ def fuzz_other(folder, kind, count):
     return fuzz(content, path, lambda: read(path), count, kind)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("known")
 @pytest.mark.parametrize("name", OF_A_RUN)
 def test_mutated_files_of_a_run(run, tmp_path, name):

@@ -301,6 +301,7 @@ def reaction(receive, truth_n, settled_n, begin_ms=BEGIN_MS):
     return (*describe(received, begin_ms), ratios)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", range(len(EVENTS)), ids=lambda order: EVENTS[order].words)
 def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
     order, promise, truth_n, settled_n
@@ -314,6 +315,7 @@ def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
     promise(order, event.words, *found, event.duty)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_a_height_that_freezes_anywhere_in_its_motion(name, truth_n, settled_n):
     """Fast, or at a turning point: before the observer has turned it into a force."""
@@ -350,6 +352,7 @@ def test_a_height_that_jumps(offset_m, truth_n, settled_n):
         assert max(errors_n) <= MOST * settled_n[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBSERVERS)
 @pytest.mark.parametrize(("offset_m", "length"), [(0.0005, 66), (0.005, 40), (0.02, 66)])
 def test_a_height_that_jumps_and_is_right_again_while_the_estimate_settles(
@@ -393,6 +396,7 @@ def with_scale(scale):
     return lambda _ms, frames: wrong(0, frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_a_scale_that_is_wrong_by_two(scale, promise):
     """Nothing but a load cell contradicts it."""
@@ -425,6 +429,7 @@ def test_a_right_scale_passes_the_load_cell(name):
     assert all(it.is_valid for it in received if it.ms >= first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_ms", [700, 1200])
 def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
     def receive(observer):

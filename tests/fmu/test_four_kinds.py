@@ -46,6 +46,7 @@ def fmu_let_go(folder, spec, version, kind):
     return simulated(path, kind, starts, "strut.height_m", DURATION_S, STEP_S)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_on_a_bench_moves_it_as_the_plant_does(tmp_path, name):
     """Co-Simulation has the plant's own integrator; CVode is beyond both, so that the plant is
@@ -170,6 +171,7 @@ def test_an_applied_force_that_rises_and_falls(tmp_path):
         assert np.abs(ours - theirs).max() < reach * np.ptp(theirs), version
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
 @pytest.mark.parametrize(
     ("laws", "most"),

@@ -130,6 +130,7 @@ shares = st.lists(st.floats(0.0, 1.0), min_size=MOST, max_size=MOST)
 struts = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 1e5), st.floats(0.0, 1e4), st.just(9.81))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 @settings(deadline=None, max_examples=20)
 @given(motion=motions, at=shares, states=shares, strut=struts)

@@ -20,6 +20,7 @@ def chromium():
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "found"),
     [
@@ -40,6 +41,7 @@ def test_the_search_works_from_a_file(site, chromium, word, found):
     page.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", PAGES)
 def test_axe_finds_nothing_serious(site, chromium, name, scheme):

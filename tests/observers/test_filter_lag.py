@@ -100,6 +100,7 @@ EVENTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("event", EVENTS)
 def test_the_stated_deviation_holds_the_error_of_a_filter_that_lags(event):
     """The reference bench, without noise: all of the error is lag."""

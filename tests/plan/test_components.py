@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 TOY = '''
 """A body on a spring and damper in Python, and an observer that is proportional alone."""
 import json, sys
@@ -213,6 +215,7 @@ print(json.dumps({
 '''
 
 
+@pytest.mark.slow
 def test_a_further_quantity_reaches_configuration_log_replay_and_csv(tmp_path: Path) -> None:
     script = tmp_path / "quantity.py"
     script.write_text(QUANTITY)

@@ -44,6 +44,7 @@ def test_a_run_is_arrays_by_column(tmp_path):
         run["nosuch"]
 
 
+@pytest.mark.slow
 def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
     """A bench of the plant's own model with friction that the nominal one lacks."""
     t_s = np.arange(0.0, 12.0, 2e-3)

@@ -278,6 +278,7 @@ CHECKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EFFECT_KINDS)
 def test_effect_does_what_its_textbook_says(name):
     CHECKS[name]()

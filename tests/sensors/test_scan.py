@@ -185,6 +185,7 @@ def test_an_encoder_without_an_event_timer_has_its_own(bus, network):
     assert [(item.index, item.before) for item in setting.changes] == [(0x6200, "0a00")]
 
 
+@pytest.mark.slow
 def test_a_device_without_a_node_id_is_given_one(bus, network):
     encoder(bus(), 0xFF)
     found = found_on(network)
@@ -355,6 +356,7 @@ def test_a_new_sensor_is_given_a_node_id_and_set(bus, channel, tmp_path):
     assert node.object_dictionary.read(0x6200, 0) == 3
 
 
+@pytest.mark.slow
 def test_a_new_device_that_is_no_sensor_keeps_no_node_id(bus, channel, tmp_path):
     node = encoder(bus(), 0xFF)
     node.object_dictionary.write(0x1000, 0, DRIVE)

@@ -110,6 +110,7 @@ def test_smooth_laws_converge_with_fourth_order():
     np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 4.0, atol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -146,6 +147,7 @@ SWITCHING = ("hysteresis", "backlash", "stop", "foreign-friction", "foreign-back
 """Kinds with laws that switch."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [*(("friction", k) for k in range(4)), *((kind, 5) for kind in SWITCHING)],
@@ -468,6 +470,7 @@ def test_prescribed_motion_keeps_to_its_stroke_and_its_derivatives():
     np.testing.assert_allclose(np.gradient(velocity, 1e-4)[1:-1], acceleration[1:-1], atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", [f for f in FAMILIES if f in dyno.FAMILIES])
 def test_dyno_gives_the_forces_of_a_free_bench_that_moves_likewise(family):
     """A law along the motion of a free bench has the force that it had on that bench."""

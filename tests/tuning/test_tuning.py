@@ -106,6 +106,7 @@ def test_noise_latency_and_gains_come_from_a_run(late):
         write_config(ready, [found], late / "run" / "tuned.yaml")
 
 
+@pytest.mark.slow
 def test_an_applied_force_that_arrives_late_is_reported(tmp_path, capsys, monkeypatch):
     folder = bench(tmp_path, force_latency_ns=4_000_000)
     _, found = tuned(folder)
@@ -117,6 +118,7 @@ def test_an_applied_force_that_arrives_late_is_reported(tmp_path, capsys, monkey
     assert "The rest is a delay of the sensor" in shown
 
 
+@pytest.mark.slow
 def test_dry_friction_is_not_taken_for_a_delay_of_the_applied_force(tmp_path):
     """Its hysteresis depends on the displacement, as the rate of the force seems to."""
     parameters = {"coulomb_force_n": 12.0, "presliding_m": 2e-4}
@@ -126,6 +128,7 @@ def test_dry_friction_is_not_taken_for_a_delay_of_the_applied_force(tmp_path):
     assert found.latency.std_s < 0.05e-3
 
 
+@pytest.mark.slow
 def test_another_model_is_tuned_with_the_frames_of_a_run(late):
     """A run with the old model is enough: its frames are followed again with the new one."""
     ready, before = tuned(late)
@@ -184,6 +187,7 @@ def test_a_late_force_leaves_its_rate_in_the_residual_force():
     assert part_by_late_force(stretch._replace(applied_n=nothing), residual_n) == 0.0
 
 
+@pytest.mark.slow
 def test_one_sine_does_not_tell_the_latency(tmp_path):
     folder = bench(tmp_path, latency_ns=5_000_000, sines=((100.0, 10.0),))
     _, found = tuned(folder)
@@ -191,6 +195,7 @@ def test_one_sine_does_not_tell_the_latency(tmp_path):
     assert found.delay_s == 0.0
 
 
+@pytest.mark.slow
 def test_the_choice_is_the_least_of_its_neighbours(late):
     for kind in ("kalman", "pi"):
         _, found = tuned(late, kind, StatedExpectation(60.0, 5.0))
@@ -214,6 +219,7 @@ def test_less_noise_and_less_force_give_a_smaller_error(late):
     assert quieter.observer.filter.bandwidth_hz > some.observer.filter.bandwidth_hz
 
 
+@pytest.mark.slow
 def test_an_observer_settles_in_time_although_noise_alone_would_make_it_slower(late):
     """A model that lacks little: the slower the filter, the smaller the error."""
     little = StatedExpectation(1.0, 0.3, 1e-4)

@@ -150,6 +150,7 @@ def test_runs_are_laid_over_one_another(made, server):
         assert len(set(looks)) == len(looks) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 390])
 def test_nothing_keeps_anybody_out(made, run, scheme, width):
@@ -162,6 +163,7 @@ def test_nothing_keeps_anybody_out(made, run, scheme, width):
         assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1100, 390])
 @pytest.mark.parametrize("kind", ["run", "diagnosis"])
 def test_reports_keep_nobody_out(made, run, tmp_path, kind, width):
@@ -231,6 +233,7 @@ def sheet(tmp_path, speeds):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [1, 8, 20])
 def test_a_damper_sheet_is_one_page_of_a4(made, tmp_path, points):
     opened = printed(made, sheet(tmp_path, np.linspace(0.02, 0.29, points).round(4).tolist()))
@@ -285,6 +288,7 @@ def one_point_band():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "converted"),
     [
@@ -317,6 +321,7 @@ def test_the_charts_of_a_report_change_their_units(made, tmp_path):
     opened.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1100, 390])
 def test_a_damper_sheet_keeps_nobody_out(made, tmp_path, width):
     opened = made.new_page(viewport={"width": width, "height": 900})
@@ -330,6 +335,7 @@ def test_a_damper_sheet_keeps_nobody_out(made, tmp_path, width):
     opened.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ["waiting", "safe_innovation"])
 def test_a_live_page_keeps_nobody_out(made, states, scheme, name):
@@ -379,6 +385,7 @@ BANNERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BANNERS)
 def test_the_banner_states_mode_cause_and_action(made, states, name):
     word, text, action = BANNERS[name]
