@@ -4,6 +4,7 @@ Each bench has equations of its own, those of the diagnosis' tests.
 """
 
 import numpy as np
+import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
@@ -69,6 +70,7 @@ def wrong(model, share=0.7, names=None):
     return DartPlant(model.model_copy(update={"struts": struts}))
 
 
+@pytest.mark.slow
 def test_a_strut_on_a_trailing_arm(tmp_path):
     arm = TrailingArm()
     t_s, heights_m = arm.heights(duration_s=4.0, rate_hz=RATE_HZ)

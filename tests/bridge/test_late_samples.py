@@ -23,6 +23,7 @@ def undisturbed():
     return Trial().run(END_MS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [1, 2, 3, 5, 9, 13])
 def test_behind_frames_that_were_held_back_all_is_as_if_they_had_not_been(held, undisturbed):
     gateway, holding = Gateway(held, 250), []

@@ -75,6 +75,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["export", "replay", "report", "diagnose"])
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_command_names_what_is_damaged_and_fails(

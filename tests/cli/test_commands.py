@@ -164,6 +164,7 @@ def test_a_missing_file_is_one_line_and_exit_code_2(
     assert "nothing.yaml" in one_line(capsys)
 
 
+@pytest.mark.slow
 def test_an_interface_that_is_not_there_is_one_line_and_exit_code_2(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -168,6 +168,7 @@ def test_a_sampled_input_costs_no_more_than_the_second_order_of_its_interpolatio
     assert order >= 1.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", ["revolute", "ball", "free"])
 def test_order_of_convergence_is_two_or_more_where_bodies_turn(joint):
     axis = "axis: [0.2, 1.0, 0.1]," if joint == "revolute" else ""
@@ -532,6 +533,7 @@ STIFFNESS = st.floats(2.0, 6.5).map(lambda power: 10.0**power)
 RATIO = st.floats(0.02, 3.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(masses=st.tuples(MASS, MASS), stiffnesses=st.tuples(STIFFNESS, STIFFNESS), ratio=RATIO)
 def test_a_linear_bench_is_right_to_a_thousandth_or_refused(masses, stiffnesses, ratio):

@@ -35,6 +35,7 @@ def test_a_right_model_is_at_the_noise_floor_and_a_wrong_one_is_not():
     assert wrong.figures.height_rmse_m.after > 20.0 * floor_m
 
 
+@pytest.mark.slow
 def test_the_error_is_that_before_the_correction_in_a_diagnosis():
     runs = [little_bench.run(little_bench.Nothing(), seed=seed) for seed in (1, 2)]
     spec = little_bench.model(mass=HEAVY)
@@ -134,6 +135,7 @@ def with_gap(run, *gaps_s):
     )
 
 
+@pytest.mark.slow
 def test_a_right_model_is_at_the_noise_floor_beside_long_gaps():
     whole = little_bench.run(little_bench.Nothing(), seed=3)
     run = with_gap(whole, (3.0, 3.2), (3.5, 3.55), (8.0, 8.4))
@@ -148,6 +150,7 @@ def test_a_right_model_is_at_the_noise_floor_beside_long_gaps():
     assert not np.any((series.t_s > 3.0) & (series.t_s < 3.2) & np.isfinite(series.measured))
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_beside_long_gaps():
     runs = [
         with_gap(little_bench.run(little_bench.Nothing(), seed=seed), (4.0, 4.3), (9.0, 9.1))

@@ -169,6 +169,7 @@ def check_scaled(case, scale):
         assert other.noise_floor.height_rmse_m == pytest.approx(floor, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "scale"),
     [
@@ -266,6 +267,7 @@ LONG_CORNERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "mass", "stiffness", "damping"),
     CORNERS + [pytest.param(*corner, marks=pytest.mark.long) for corner in LONG_CORNERS],
@@ -334,6 +336,7 @@ def of_two_parts(case, order):
     return diagnose(kind_of(case).model(), [parts[k] for k in order], [test]).diagnosis
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["friction", pytest.param("dyno stop", marks=pytest.mark.long)])
 def test_a_recording_cut_in_two_gives_the_same_answer(case):
     same_answer(answer(case).diagnosis, of_two_parts(case, (0, 1)), rel=0.02)
@@ -345,6 +348,7 @@ def test_the_order_of_recordings_changes_nothing(case):
     same_answer(of_two_parts(case, (0, 1)), of_two_parts(case, (1, 0)), rel=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     ["friction", *(pytest.param(c, marks=pytest.mark.long) for c in ("dyno stop", "complete"))],
@@ -382,6 +386,7 @@ def test_another_name_of_the_strut_changes_the_name_only(case):
 # --- 5. Idempotence ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [

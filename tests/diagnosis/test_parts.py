@@ -59,6 +59,7 @@ def test_about_as_many_samples_are_looked_at_as_are_asked_for(nodes, most, thinn
     assert kept >= min(nodes / thinned, 0.7 * most) - 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bench", [little_bench, little_dyno])
 def test_parts_that_are_kept_back_are_not_looked_at(bench):
     recording = bench.run(bench.Nothing(), duration_s=60.0)

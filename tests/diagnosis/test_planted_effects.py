@@ -265,6 +265,7 @@ class GainAndSpring(Nothing):
         return -200.0 * (z - FREE)
 
 
+@pytest.mark.slow
 def test_a_gain_beside_another_spring_is_not_a_mass_and_a_damper():
     runs = [
         bench.run(GainAndSpring(), gravity=0.0),
@@ -276,6 +277,7 @@ def test_a_gain_beside_another_spring_is_not_a_mass_and_a_damper():
     assert any("gain" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_spring_and_a_damper_that_are_softer_are_no_gain_with_another_mass():
     runs = [bench.run(Nothing()), bench.run(Nothing(), seed=2)]
     given = bench.model(
@@ -329,6 +331,7 @@ def test_a_force_outside_the_catalogue_is_not_explained():
     assert found.held_out.height_rmse_m.after <= found.held_out.height_rmse_m.before
 
 
+@pytest.mark.slow
 def test_missing_samples_and_uneven_times_change_nothing():
     record = bench.run(Stiffness())
     rng = np.random.default_rng(5)

@@ -286,6 +286,7 @@ def test_arguments_choose_groups_and_counts(monkeypatch):
         command._arguments()
 
 
+@pytest.mark.slow
 def test_filled_slots_hold_what_they_are_for():
     assert fill(Slot("dyno", "dyno_friction", 0, 0)).is_dyno
     assert fill(Slot("single", "preload", 0, 0)).families == ("preload",)

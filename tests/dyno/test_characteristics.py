@@ -79,6 +79,7 @@ def tested():
     return characterise_record(ForceRecord("whole", *whole_test()))
 
 
+@pytest.mark.slow
 def test_a_whole_test_is_divided_into_its_parts(tested):
     kinds = ["warm_up", "quasi_static", *["velocity_step"] * 6]
     assert [step.kind for step in tested.steps] == kinds
@@ -205,6 +206,7 @@ def test_gaps_few_samples_and_coarse_forces_are_said():
     assert any("12.0 samples a cycle" in text for text in said)
 
 
+@pytest.mark.slow
 def test_a_cell_that_drifts_is_said():
     t_s, x, force, _ = whole_test()
     rest = np.full(1000, 0.3)

@@ -74,6 +74,7 @@ def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched
     assert not any(found[other].differs for other in untouched)
 
 
+@pytest.mark.slow
 def test_over_a_dose():
     pressures = (2.0, 4.0, 6.0, 8.0)
     states = [state(k, gas_n=50.0 * bar) for k, bar in enumerate(pressures)]
@@ -146,6 +147,7 @@ def test_a_step_of_another_speed_is_no_step_of_the_point(tmp_path):
     assert found[0].force.high - found[0].force.low > 100.0
 
 
+@pytest.mark.slow
 def test_the_command_says_pass_or_fail(tmp_path):
     path = written(tmp_path / "dyno.csv", columns(5))
     rows = "0.1,350,380,20,50\n0.3,650,680,-280,-250\n\n"  # as a spreadsheet writes it

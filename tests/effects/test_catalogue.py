@@ -541,6 +541,7 @@ LOOPS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameters"), LOOPS, ids=str)
 def test_a_closed_loop_takes_energy(name, parameters):
     """The last of several equal cycles, whose states begin and end alike."""

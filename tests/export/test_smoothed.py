@@ -86,6 +86,7 @@ def test_a_smoothed_force_is_far_nearer_than_the_one_of_the_run(reference):
     assert held > 0.9
 
 
+@pytest.mark.slow
 def test_struts_that_move_each_other_are_smoothed_together(tmp_path):
     """In a quarter car each virtual force moves both heights."""
     truth_n = bench_run(tmp_path, "quarter_car")
@@ -95,6 +96,7 @@ def test_struts_that_move_each_other_are_smoothed_together(tmp_path):
         assert held > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observer", [{"kind": "pi"}, KALMAN])
 def test_lost_heights_cost_what_the_deviation_says(tmp_path, observer):
     """A fifth of the frames is lost: gaps of many ticks, in some of which the bridge holds."""
@@ -110,6 +112,7 @@ def test_lost_heights_cost_what_the_deviation_says(tmp_path, observer):
     assert np.mean(np.abs(missed) < 1.96 * std[known]) > 0.9
 
 
+@pytest.mark.slow
 def test_an_old_height_is_taken_at_its_own_time(tmp_path):
     """The model's force is that of its time, with an applied force that is not late."""
     height = {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT", "delay_s": 0.005}

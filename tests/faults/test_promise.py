@@ -335,6 +335,7 @@ def test_a_height_that_stays_frozen_is_never_believed_without_any_limit(name):
     assert not any(it.is_valid for it in received if it.ms > BEGIN_MS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_m", [-0.05, 0.001, 0.05])
 def test_a_height_that_jumps(offset_m, truth_n, settled_n):
     """A foot that slips, another zero: valid again when the observer has followed."""
@@ -369,6 +370,7 @@ def test_a_height_that_jumps_and_is_right_again_while_the_estimate_settles(
     assert received[-1].is_valid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "offset_m"), [(6, 0.0005), (10, 0.005), (20, 0.02), (30, 0.05), (80, 0.05)]
 )
@@ -421,6 +423,7 @@ def test_a_scale_that_is_wrong_by_two(scale, promise):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_a_right_scale_passes_the_load_cell(name):
     trial = trial_with_auxiliary("load_cell_force", observer=OBSERVERS[name], limits=[CELL_LIMIT])
@@ -456,6 +459,7 @@ def test_an_interlock_that_opens(promise, truth_n, settled_n):
     promise(50, words, *reaction(receive, truth_n, settled_n), duty)
 
 
+@pytest.mark.slow
 def test_an_applied_force_of_its_own_message_that_stops(promise, truth_n, settled_n):
     def receive(observer):
         trial = Trial(observer=observer)

@@ -74,6 +74,7 @@ def test_warn_tells_of_it_and_changes_nothing_else():
     assert 1.0 in {flags["LIMIT_FAULT"] for flags in status_flags(warned, 0, 900)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["height_m", "force_n", "virtual_force_n", "innovation_m"])
 def test_hold_marks_the_estimate_invalid_as_long_as_it_lasts(value):
     """No longer: the estimate has not lost what it had settled to."""

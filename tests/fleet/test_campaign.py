@@ -47,6 +47,7 @@ def rows(out, columns="source, bench, damper, date, verdict, error"):
     return store.query(out, f"SELECT {columns} FROM runs ORDER BY source")[1]
 
 
+@pytest.mark.slow
 def test_every_run_is_a_row_with_its_values(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)
     end = run_campaign(sources, given(fleet), tmp_path / "store", threads, 4)
@@ -72,6 +73,7 @@ def test_every_run_is_a_row_with_its_values(fleet, tmp_path):
         assert low < 20.0 < high
 
 
+@pytest.mark.slow
 def test_a_fleet_that_was_ended_is_gone_on_with(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)
     stopped = 0
@@ -91,6 +93,7 @@ def test_a_fleet_that_was_ended_is_gone_on_with(fleet, tmp_path):
     assert run_campaign(sources, given(fleet), tmp_path, threads, 4).done == 0
 
 
+@pytest.mark.slow
 def test_shards_are_all_of_it_and_nothing_twice(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)
     parts = [select_shard(sources, k, 3) for k in (1, 2, 3)]

@@ -47,6 +47,7 @@ def test_wear_is_a_drift_and_no_change():
     assert covered >= 0.85 * DAMPERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scatter", [0.005, 0.01, 0.02])
 @pytest.mark.parametrize(
     ("kind", "factor"),

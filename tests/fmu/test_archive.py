@@ -210,6 +210,7 @@ def test_a_reset_instance_begins_anew(tmp_path, version):
         assert got(instance, places, ["strut.height_m"]) == first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize(
     "wrong",

@@ -65,6 +65,7 @@ BRISTLES = {"elastoplastic_friction", "lugre_friction", "presliding_friction"}
 """Laws that turn within a few µm: within 20 µs at the speed of the motion below."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_as_a_strut_gives_the_force_of_the_plant(tmp_path, name):
     """Under a motion that is prescribed; in steps that are short, since both round the sine off."""

@@ -92,6 +92,7 @@ def test_the_run_is_repeated_bit_for_bit(run: Path) -> None:
     assert again.different == 0
 
 
+@pytest.mark.slow
 def test_the_run_is_diagnosed_as_its_own_data_are_as_csv(run: Path, tmp_path: Path) -> None:
     record = read_recording(run)
     assert record.strut_forces_n is not None
@@ -119,6 +120,7 @@ def test_the_run_is_diagnosed_as_its_own_data_are_as_csv(run: Path, tmp_path: Pa
         assert found.parameters[name].value == pytest.approx(value, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_corrected_model_on_the_bus_lacks_nothing(run: Path, tmp_path: Path) -> None:
     model = load_model(CONFIGS / "dyno_model.yaml")
     diagnose_runs([run], model, [], tmp_path / "found", lambda _what, _share: None)

@@ -164,6 +164,7 @@ print(json.dumps({
 '''
 
 
+@pytest.mark.slow
 def test_another_engine_and_another_observer_run_replay_and_are_checked(tmp_path: Path) -> None:
     script = tmp_path / "toy.py"
     script.write_text(TOY)

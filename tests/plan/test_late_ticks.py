@@ -76,6 +76,7 @@ def test_gaps_in_phase_with_a_tenth_of_a_second_are_the_hosts_quota():
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_gaps_at_random_times_are_not_put_down_to_a_quota():
     random.seed(3)
     wrong = 0

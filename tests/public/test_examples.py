@@ -40,6 +40,7 @@ SLOW = ("foreign_dbc", "quarter_car")
 """Each takes a minute or two."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in SLOW)) for name in FOUND]
 )

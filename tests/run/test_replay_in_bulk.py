@@ -25,6 +25,7 @@ def ready_for(ticks: int, **changed: object) -> Plan:
     return ready.with_config(ready.config.model_copy(update={"supervision": supervision}))
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(
     faults=st.dictionaries(st.integers(0, 299), st.sampled_from(FAULTS), max_size=30),

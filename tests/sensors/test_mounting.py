@@ -180,6 +180,7 @@ def test_lengths_that_are_near_leave_the_direction_as_it_was(change_m):
     assert found.scale is None
 
 
+@pytest.mark.slow
 def test_what_arrived_instead_of_a_reading(tmp_path, runs):
     path = config(tmp_path)
     silent = zero(path, "--length-m", 0.36, "--listen-s", 0.2)  # a virtual bus without a bench

@@ -347,6 +347,7 @@ def set_new(channel, undo, node_id=9):
     return CliRunner().invoke(app, [*arguments, "--new", "--cycle-ms", "3", "--before", str(undo)])
 
 
+@pytest.mark.slow
 def test_a_new_sensor_is_given_a_node_id_and_set(bus, channel, tmp_path):
     node = encoder(bus(), 0xFF)
     result = set_new(channel, tmp_path / "before.yaml")

@@ -336,6 +336,7 @@ def test_fractional_force_leads_by_its_order():
     assert np.angle(force / height) == pytest.approx(order * np.pi / 2, abs=0.08)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_cases():
     first, second = short_case(11, "pair"), short_case(11, "pair")
     assert first == second
@@ -385,6 +386,7 @@ def test_floor_is_what_band_limited_inverse_dynamics_leave():
     assert np.std(force) == pytest.approx(force_noise_floor_n(case), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_right_model_leaves_the_sensors_error_and_what_the_loads_resolution_moves():
     case = make_case(2, "complete")
 
@@ -441,6 +443,7 @@ def test_roughness_leaves_the_bench_as_it_is():
     assert case.nominal == case.bench
 
 
+@pytest.mark.slow
 def test_rough_kinds_draw_roughness_and_plant_nothing_linear():
     cases = [make_case(seed, "rough_complete") for seed in range(8)]
     gains = [case.roughness.input_gain for case in cases]
@@ -489,6 +492,7 @@ def test_dyno_gives_the_forces_of_a_free_bench_that_moves_likewise(family):
     np.testing.assert_allclose(along.force_n[moving], expected[moving], atol=1e-4 * scale)
 
 
+@pytest.mark.slow
 def test_dyno_measures_spring_damper_and_effects(tmp_path):
     case = make_case(3, "dyno_preload")
     run, _ = write_case(case, tmp_path)
@@ -505,6 +509,7 @@ def test_dyno_measures_spring_damper_and_effects(tmp_path):
     assert strut_force_n(bench, motion).shape == quiet.shape
 
 
+@pytest.mark.slow
 def test_dyno_kinds_are_what_they_say():
     cases = [make_case(seed, "dyno_complete") for seed in range(8)]
     assert 0 < sum(case.roughness.is_exact for case in cases) < 8

@@ -209,6 +209,7 @@ def test_the_choice_is_the_least_of_its_neighbours(late):
         assert found.latency is None
 
 
+@pytest.mark.slow
 def test_less_noise_and_less_force_give_a_smaller_error(late):
     some, less, quieter = (
         tuned(late, source=StatedExpectation(*given))[1].tuned
@@ -302,6 +303,7 @@ def test_a_tuned_run_is_replayed_bit_by_bit(late):
     assert plan_of_run(late / "run").config.observers["strut"].kind == "kalman"
 
 
+@pytest.mark.slow
 def test_an_observer_that_states_no_deviation_does_not_suit_such_a_limit(late, monkeypatch, capsys):
     text = (late / "rig.yaml").read_text()
     limit = "supervision: {limits: [{value: force_std_n, high: 100, action: hold}]}"

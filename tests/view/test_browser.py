@@ -199,6 +199,7 @@ def printed(made, path):
     return opened
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["run", "diagnosis"])
 def test_no_chart_is_cut_on_paper(made, run, tmp_path, kind):
     path = tmp_path / "report.html"

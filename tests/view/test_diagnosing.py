@@ -78,6 +78,7 @@ def test_the_end_of_the_server_ends_it(run):
     assert job.wait() == -signal.SIGTERM
 
 
+@pytest.mark.slow
 def test_what_fails_says_why(tmp_path):
     with serving(make_run(tmp_path / "short", 30), token="secret") as server:
         post(server, "/diagnose?run=0")
@@ -86,6 +87,7 @@ def test_what_fails_says_why(tmp_path):
     assert "expected at least" in found["why"]
 
 
+@pytest.mark.slow
 def test_it_imports_no_module_of_the_working_directory(foreign_modules, tmp_path):
     with serving(make_run(tmp_path / "short", 30), token="secret") as server:
         post(server, "/diagnose?run=0")

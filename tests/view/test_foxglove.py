@@ -110,6 +110,7 @@ def published():
         view.close()
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_a_finished_run_is_played_whole(original, client, published):
     view = published(original)
