@@ -171,16 +171,16 @@ def init(
     mass_kg = _known(
         mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
     )
-    length_at_rest_m = _known(
-        length_at_rest_m, "--length-at-rest-m", "Length of the strut at rest, by a rule, m", None
-    )
+    if length_at_rest_m is None and free_length_m is None:
+        question = "Length of the strut at rest, by a rule, m (or give --free-length-m)"
+        length_at_rest_m = _known(None, "--length-at-rest-m", question, None)
     if not is_measured:
         stiffness_n_per_m = _known(
             stiffness_n_per_m, "--stiffness-n-per-m", "Stiffness, roughly, N/m", None
         )
     model, source = _first_model(mass_kg, length_at_rest_m, stiffness_n_per_m, damping_n_s_per_m)
-    if free_length_m is None and is_dyno:
-        free_length_m = length_at_rest_m  # no weight rests on the strut
+    # On a dyno no weight rests on the strut.
+    free_length_m = free_length_m or (length_at_rest_m if is_dyno else None)
     model = replace(model, stated_free_length_m=free_length_m)
     if is_measured:
         fit = _measure(proposal, model, run, listen_s)
@@ -223,7 +223,10 @@ def _ask_place(name: str) -> "Force | None":
 
 
 def _first_model(
-    mass_kg: float, rest_m: float, stiffness_n_per_m: float | None, damping_n_s_per_m: float | None
+    mass_kg: float,
+    rest_m: float | None,
+    stiffness_n_per_m: float | None,
+    damping_n_s_per_m: float | None,
 ) -> "tuple[FirstModel, str]":
     from rig.new_bench.first_model import FirstModel, rough_damping_n_s_per_m
 
@@ -325,7 +328,8 @@ def _print(
         f"{model.damping_n_s_per_m:.0f} N·s/m ({source}), free length {model.free_length_m:.4g} m"
     )
     print_text(f"Written: {out}, {model_file}. Read them.")
+    length = "LENGTH" if model.rest_m is None else f"{model.rest_m:g}"
     print_text(
-        f"Next, with the bench at rest: `rig zero {out} --length-m {model.rest_m:g}`, or another "
-        "length that you measure now"
+        f"Next, with the bench at rest: `rig zero {out} --length-m {length}`, with the length of "
+        "the strut that you measure then"
     )

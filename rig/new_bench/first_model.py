@@ -68,13 +68,13 @@ class FirstModel:
 
     Attributes:
         mass_kg: Mass that moves with the strut's upper end.
-        rest_m: Length of the strut at rest.
+        rest_m: Length of the strut at rest; None where only the free length is known.
         stated_free_length_m: Length of the strut without a force, by a drawing; None if it follows
             from the length at rest.
     """
 
     mass_kg: float
-    rest_m: float
+    rest_m: float | None
     stiffness_n_per_m: float
     damping_n_s_per_m: float
     stated_free_length_m: float | None = None
@@ -84,6 +84,7 @@ class FirstModel:
         """Length of the strut without a force: the weight shortens it."""
         if self.stated_free_length_m is not None:
             return self.stated_free_length_m
+        assert self.rest_m is not None, "one of the two lengths is known"
         return self.rest_m + self.mass_kg * GRAVITY_M_PER_S2 / self.stiffness_n_per_m
 
     @property

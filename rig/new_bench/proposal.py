@@ -43,14 +43,20 @@ _UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
 _LEAST_RATE_HZ, _LARGEST_RATE_HZ, _USUAL_RATE_HZ = 100.0, 2000.0, 1000.0
 """Rates of the bridge: that of the height where it lies between, else the usual one."""
 
-_VALID_WORDS = ("valid", "vld", "gueltig", "qual", "ok", "healthy")
-_OK_CHOICES = ("ok", "valid", "good", "gueltig", "healthy")
-_WORKS = "(?:healthy|valid|ok|good|in order|gueltig)"
+_VALID_WORDS = ("valid", "vld", "gueltig", "geldig", "qual", "ok", "healthy")
+_OK_CHOICES = ("ok", "valid", "good", "gueltig", "gültig", "geldig", "válid", "healthy")
+_WORKS = "(?:healthy|valid[eoa]?|válid[oa]|ok|good|in order|gueltig|gültig|geldig)"
 _FAULT_WORDS = ("fault", "error", "fehler", "invalid", "fail")
 _COUNTER_BITS = range(2, 9)
 """Bits of a message counter: two (the least that shows a repetition) to eight."""
 
-_COUNTER_WORDS = ("counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount", "seq")
+_COUNTER_WORDS = (
+    "counter", "cnt", "alive", "rolling", "zaehler", "bz", "ctr", "msgcount", "seq", "compteur",
+    "teller", "contador", "contatore",
+)  # fmt: skip
+_COUNTS = re.compile("counter|count|zähler|zaehler|compteur|teller|contador|contatore|rolling")
+"""Words of a comment on a counter of messages."""
+
 _STATE_WORDS = ("state", "mode", "status", "zustand")
 _ELSEWHERE = -1.0
 """Score below which a force is that of another place, such as a brake's, or a command."""
@@ -370,7 +376,9 @@ def _hints_at_checks(choice: Choice, found: Mapping[str, str]) -> list[str]:
         if not item.unit and not item.is_float and item.name != choice.signal.name
     ]
     bits = [item.name for item in small if item.length_bits == 1]
-    counters = [item.name for item in small if item.length_bits in _COUNTER_BITS]
+    counters = [item for item in small if item.length_bits in _COUNTER_BITS]
+    # What its comment calls a counter comes first.
+    counters = [it.name for it in sorted(counters, key=lambda item: not _counts(item))]
     hints: list[str] = []
     if "valid" not in found and bits:
         hints.append(
@@ -406,9 +414,7 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
         signal
         for signal in message.signals.values()
         if not signal.unit and not signal.is_float and signal.length_bits <= 2
-        if _has_word(signal, _VALID_WORDS)
-        or _is_described_as_valid(signal)
-        or _has_word(signal, _FAULT_WORDS)
+        if _states_validity(signal) or _has_word(signal, _FAULT_WORDS)
     ]
     # The signal's own, or one that belongs to no other signal; a counter is of the whole message.
     own = [item for item in flags if _shares_a_word(item.name, measured.name)]
@@ -423,7 +429,7 @@ def _find_flag(message: Message, measured: Signal) -> tuple[str, int] | None:
         return None
     (flag,) = chosen
     for raw, text in flag.choices.items():
-        if any(text.lower().startswith(word) for word in _OK_CHOICES):
+        if text.lower().startswith(_OK_CHOICES):
             return flag.name, raw
     return flag.name, 0 if _has_word(flag, _FAULT_WORDS) else 1
 
@@ -433,6 +439,20 @@ def _is_described_as_valid(signal: Signal) -> bool:
     return (
         re.match(rf"1\s*[:=]?\s*(?:\w+\s+)?(?:is\s+)?{_WORKS}\b", signal.comment.lower())
         is not None
+    )
+
+
+def _counts(signal: Signal) -> bool:
+    return _COUNTS.search(signal.comment.lower()) is not None
+
+
+def _states_validity(signal: Signal) -> bool:
+    """Whether name, comment or values of a signal say that it marks something as valid."""
+    values = [text.lower() for text in signal.choices.values()]
+    return (
+        _has_word(signal, _VALID_WORDS)
+        or _is_described_as_valid(signal)
+        or any(value.startswith(_OK_CHOICES) for value in values)
     )
 
 
@@ -475,27 +495,44 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
     # Validity and mode may have another message, but never one that another node sends.
     sender = best.message.sender
     near = [best.message, *(it for it in free if it is not best.message and it.sender == sender)]
-    valid = _find_integer(near, _VALID_WORDS, lambda bits: bits >= 1)
+    valid = _find_integer(near, _states_validity, lambda bits: bits >= 1)
     lines += (
         [f"  {VALID.key}: {{message: {valid[0].name}, signal: {valid[1].name}}}"]
         if valid
         else [
+            *_hint_at_bits(best.message),
             "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
             "  # unsafe: {publish_without_valid: true} accepts that",
         ]
     )
     if best.message.protection is None:
-        counter = _find_integer([best.message], _COUNTER_WORDS, lambda bits: bits > 1)
+        counter = _find_integer(
+            [best.message],
+            lambda signal: _has_word(signal, _COUNTER_WORDS) or _counts(signal),
+            lambda bits: bits > 1,
+        )
         if counter:
             entry = f"{{message: {counter[0].name}, signal: {counter[1].name}}}"
             lines.append(f"  {COUNTER.key}: {entry}")
-    state = _find_integer(near, _STATE_WORDS, lambda bits: bits >= _LEAST_STATE_BITS)
+    state = _find_integer(
+        near, lambda signal: _has_word(signal, _STATE_WORDS), lambda bits: bits >= _LEAST_STATE_BITS
+    )
     if any(item.name == STATUS_MESSAGE for item in free):
         lines.append(f"status: {STATUS_MESSAGE}")
     elif state:
         entry = f"{{message: {state[0].name}, signal: {state[1].name}}}"
         lines += ["status:", f"  state: {entry}"]
     return lines
+
+
+def _hint_at_bits(message: Message) -> list[str]:
+    """A comment that names the bits of a message, one of which may mark the estimate as valid."""
+    bits = [item.name for item in message.signals.values() if item.length_bits == 1]
+    if not bits:
+        return []
+    return [f"  # if this is its bit: valid: {{message: {message.name}, signal: {bits[0]}}}"] + (
+        [f"  # or {', '.join(bits[1:])}"] if bits[1:] else []
+    )
 
 
 def _hint_at_messages(forces: Sequence[str]) -> list[str]:
@@ -534,15 +571,15 @@ def _publish_line(key: str, best: RankedSignal, found: Sequence[RankedSignal]) -
 
 
 def _find_integer(
-    messages: Iterable[Message], words: Sequence[str], fits: Callable[[int], bool]
+    messages: Iterable[Message], is_meant: Callable[[Signal], bool], fits: Callable[[int], bool]
 ) -> tuple[Message, Signal] | None:
-    """The first integer signal without a unit that has one of some words in its name."""
+    """The first integer signal without a unit that is meant, and whose bits fit."""
     found = (
         (message, signal)
         for message in messages
         for signal in sorted(message.signals.values(), key=lambda item: item.length_bits)
         if not signal.unit and not signal.is_float and fits(signal.length_bits)
-        if _has_word(signal, words)
+        if is_meant(signal)
     )
     return next(found, None)
 

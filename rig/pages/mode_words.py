@@ -41,7 +41,7 @@ MEANINGS: Mapping[Mode, str] = {
     Mode.READY: "The estimate has settled and is not armed. Force output invalid.",
     Mode.RUNNING: "Force output valid.",
     Mode.HOLD: "Force output invalid until the cause has gone.",
-    Mode.SAFE: "Model stopped, force output invalid until acknowledged.",
+    Mode.SAFE: "The model is stopped, not the bench. Force output invalid until acknowledged.",
 }
 
 _SENTENCES: Mapping[str, str] = {

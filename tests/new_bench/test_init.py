@@ -92,6 +92,14 @@ def test_a_free_length_of_a_drawing_is_taken(rig, tmp_path):
     assert "0.412   # as stated" in (tmp_path / "my_model.yaml").read_text()
 
 
+def test_a_free_length_replaces_the_length_at_rest(rig, tmp_path, capsys):
+    at = FACTS.index("--length-at-rest-m")
+    facts = (*FACTS[:at], *FACTS[at + 2 :], *NO_FORCE)
+    assert rig(*facts, "--free-length-m", "0.412") == 0
+    assert load_plan(tmp_path / "my.yaml").model.struts[0].free_length_m == 0.412
+    assert "--length-m LENGTH" in capsys.readouterr().out
+
+
 BETWEEN = 'CM_ SG_ 300 Force "Load cell between cylinder and carriage";\n'
 
 

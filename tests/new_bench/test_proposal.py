@@ -300,3 +300,42 @@ def test_what_names_of_another_language_may_mean_is_left_to_the_user(dbc):
         "message": "AFS_Hoogte",
         "signal": "AFS_Height",
     }
+
+
+FRENCH = """
+BO_ 704 CAP_Hauteur: 6 SENSOR
+ SG_ CAP_Height : 15|16@0- (0.05,0) [-1638|1638] "mm" CONTROL
+ SG_ CAP_Classe : 39|4@0+ (1,0) [0|15] "" CONTROL
+ SG_ CAP_HautNb : 35|4@0+ (1,0) [0|15] "" CONTROL
+ SG_ CAP_HautVal : 0|1@0+ (1,0) [0|1] "" CONTROL
+
+BO_ 1248 INV_Estimation: 4 CONTROL
+ SG_ INV_EstVal : 0|1@1+ (1,0) [0|1] "" SENSOR
+ SG_ INV_EstNb : 4|4@1+ (1,0) [0|15] "" SENSOR
+ SG_ INV_EstForce : 8|16@1- (0.1,0) [-3276.8|3276.7] "daN" SENSOR
+
+"""
+FRENCH_COMMENTS = """
+CM_ SG_ 704 CAP_Classe "Réglage interne du capteur";
+CM_ SG_ 704 CAP_HautNb "Compteur de messages, 0 à 15";
+CM_ SG_ 704 CAP_HautVal "1 : hauteur valide";
+CM_ SG_ 1248 INV_EstNb "Compteur de messages";
+VAL_ 1248 INV_EstVal 0 "invalide" 1 "valide" ;
+"""
+
+
+def test_comments_and_values_state_what_names_of_another_language_do_not(dbc):
+    dbc.write_text(HEADER + FRENCH + CYCLES + FRENCH_COMMENTS, "utf-8")
+    text = propose(dbc)
+    proposed = yaml.safe_load(text)
+    assert proposed["signals"]["height"]["valid"] == {"signal": "CAP_HautVal", "value": 1}
+    assert "add: counter: CAP_HautNb; or CAP_Classe" in text
+    assert proposed["publish"]["valid"] == {"message": "INV_Estimation", "signal": "INV_EstVal"}
+    assert proposed["publish"]["counter"] == {"message": "INV_Estimation", "signal": "INV_EstNb"}
+
+
+def test_bits_of_the_estimate_are_named_if_none_says_what_it_is(dbc):
+    dbc.write_text(HEADER + FRENCH + CYCLES, "utf-8")
+    assert "if this is its bit: valid: {message: INV_Estimation, signal: INV_EstVal}" in propose(
+        dbc
+    )
