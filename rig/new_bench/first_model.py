@@ -84,7 +84,8 @@ class FirstModel:
         """Length of the strut without a force: the weight shortens it."""
         if self.stated_free_length_m is not None:
             return self.stated_free_length_m
-        assert self.rest_m is not None, "one of the two lengths is known"
+        if self.rest_m is None:
+            raise ValueError("expected a length at rest or a free length")
         return self.rest_m + self.mass_kg * GRAVITY_M_PER_S2 / self.stiffness_n_per_m
 
     @property
