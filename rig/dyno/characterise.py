@@ -10,6 +10,7 @@ from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
+from rig.dyno.timeline import Span, account
 from rig.log.reader import read_run
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
@@ -22,13 +23,19 @@ _FEWEST_SAMPLES_A_CYCLE = 10
 
 @dataclass(frozen=True)
 class Characteristics:
-    """Figures of a damper from one record, whose quality is what in it may mislead."""
+    """Figures of a damper from one record.
+
+    Attributes:
+        quality: What in the record may mislead.
+        account: The whole record as steps, rests, transitions, and what was rejected and why.
+    """
 
     record: ForceRecord
     steps: tuple[DynoStep, ...]
     holds: tuple[AtRest, ...]
     damper: Damper
     quality: tuple[str, ...]
+    account: tuple[Span, ...]
 
     @property
     def name(self) -> str:
@@ -47,6 +54,7 @@ class Characteristics:
             "steps": [step.figures() for step in self.steps],
             "holds": self.holds,
             **figures,
+            "account": self.account,
             "quality": self.quality,
             "notes": notes,
         }
@@ -88,18 +96,27 @@ def characterise_record(record: ForceRecord) -> Characteristics:
     if largest_n > _LARGEST_N:
         raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
     strokes = find_strokes(t_s, height_m)
-    blocks = find_blocks(strokes)
-    steps = [step for item in blocks if (step := compute_step(record, item)) is not None]
-    if not steps:
+    blocks = find_blocks(t_s, height_m, strokes)
+    computed = [(block, compute_step(record, block)) for block in blocks]
+    kept = [(block, step) for block, step in computed if not isinstance(step, str)]
+    if not kept:
         raise InputError(
             f"{name}: no steady cycle in {len(strokes)} strokes: never three in a row of equal "
             f"amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
             "repeats its cycles"
         )
-    holds = tuple(compute_rest(record, here) for here in find_holds(t_s, height_m, blocks))
-    marked = mark_warm_up(steps)
-    warnings = quality(record, marked, holds, len(strokes))
-    return Characteristics(record, marked, holds, summarise_damper(marked), warnings)
+    rests = find_holds(t_s, height_m, blocks)
+    holds = tuple(compute_rest(record, here) for here in rests)
+    marked = mark_warm_up([step for _, step in kept])
+    rejected = {
+        stroke.first: why
+        for block, why in computed
+        if isinstance(why, str)
+        for stroke in block.strokes
+    }
+    spans = account(t_s, strokes, [block for block, _ in kept], rejected, rests)
+    warnings = quality(record, marked, holds, spans)
+    return Characteristics(record, marked, holds, summarise_damper(marked), warnings, spans)
 
 
 def _read_strut(

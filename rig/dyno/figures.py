@@ -148,20 +148,21 @@ class DynoStep(NamedTuple):
         )
 
 
-def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
-    """Figures of a block; None where it has too few samples for any, or does not repeat."""
+def compute_step(record: ForceRecord, block: Block) -> DynoStep | str:
+    """Figures of a block, or why it has none."""
     t_s, height_m, here = record.t_s, record.height_m, slice(block.begin, block.end)
     force_n = record.force_n[here]
     warm_c = None if record.temperature_c is None else record.temperature_c[here]
-    motion = fit_motion(t_s[here], height_m[here], len(block.strokes))
+    motion = fit_motion(t_s[here], height_m[here], round(2.0 * block.cycles))
     if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
-        return None
+        return f"{len(block.strokes)} strokes of one amplitude that do not repeat one motion"
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
     turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
     down, up = (mean_stroke(motion, force_n, turned, sign) for sign in (-1, 1))
     if down is None or up is None:
-        return None
+        samples = (block.end - block.begin) / block.cycles
+        return f"{len(block.strokes)} strokes with {samples:.0f} samples a cycle, which are too few"
     speed_std = motion.velocity_std_m_per_s
     sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
     speed = max(side.peak_velocity_m_per_s.value for side in sides)
@@ -169,7 +170,7 @@ def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
         "quasi_static" if speed <= _QUASI_STATIC_M_PER_S else "velocity_step",
         float(t_s[block.begin]),
         float(t_s[block.end - 1]),
-        0.5 * len(block.strokes),
+        block.cycles,
         None if np.isnan(motion.period_s) else 1.0 / motion.period_s,
         0.5 * (down.amplitude_m + up.amplitude_m),
         0.5 * (down.middle_m + up.middle_m),

@@ -8,13 +8,11 @@ import numpy as np
 from rig.dyno.figures import SIDES, AtRest, DynoStep, ForceRecord
 from rig.dyno.stroke_force import FINE, MeanStroke
 from rig.dyno.strokes import Array
+from rig.dyno.timeline import Span, words
 from rig.recordings.clipping import find_sudden_plateaus
 
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""
-
-_USED_SHARE = 0.8
-"""Share of strokes in steps below which a warning is due: ramps between steps are few."""
 
 _FEW_A_CYCLE = 16.0
 """Samples of a cycle below which a stroke has hardly eight: its shape is mostly the spline's."""
@@ -38,16 +36,16 @@ _CERTAIN = 5.0
 
 
 def quality(
-    record: ForceRecord, steps: Sequence[DynoStep], holds: Sequence[AtRest], strokes: int
+    record: ForceRecord, steps: Sequence[DynoStep], holds: Sequence[AtRest], spans: Sequence[Span]
 ) -> tuple[str, ...]:
-    """Warnings of gaps, few samples, coarse steps, a wrong sign, unused strokes, drift, poor fits.
+    """Warnings of gaps, few samples, coarse steps, a wrong sign, drift, poor fits, what is unused.
 
-    `strokes` is the number of strokes of the record.
+    `spans` account for the whole record.
     """
     t_s, force_n = record.t_s, record.force_n
     return (
         *_sign(steps),
-        *_strokes_outside_steps(steps, strokes),
+        *(words(span) for span in spans if span.use == "rejected"),
         *preflight(t_s, {"force": force_n}),
         *_few_samples(t_s, steps),
         *_coarse(force_n),
@@ -79,12 +77,6 @@ def _sign(steps: Sequence[DynoStep]) -> Iterator[str]:
             f"{step.peak_speed_m_per_s:.3g} m/s, which no damper does: is the sign of its force "
             "right (`rig import --rebound`)?"
         )
-
-
-def _strokes_outside_steps(steps: Sequence[DynoStep], strokes: int) -> Iterator[str]:
-    used = sum(round(2.0 * step.cycles) for step in steps)
-    if used < _USED_SHARE * strokes:
-        yield f"{strokes - used} of {strokes} strokes do not repeat and are not used"
 
 
 def _gaps(t_s: Array) -> Iterator[str]:

@@ -2,8 +2,10 @@
 
 A stroke goes from one turning point of the height to the next. A turning point counts when the
 height has left it by more than a share of the record's stroke and by more than its noise, so that
-neither noise nor a tremor at rest makes strokes. Consecutive strokes of one amplitude and duration
-are a block: one step of a test. What does not move for long is a hold.
+neither noise nor a tremor at rest makes strokes. Consecutive strokes of one amplitude, duration and
+shape are a block: one step of a test. A stroke in which the machine rests on its way to another
+step may have amplitude and duration of the others; its shape differs. What does not move for long
+is a hold.
 
 The motion of a block is a Fourier series where one fits to the noise, as for the usual sine
 machines; else it is smoothed.
@@ -41,6 +43,20 @@ _SAME_SHAPE = 0.03
 """Of a stroke: standard deviation from the mean shape up to which strokes repeat one another."""
 
 _SHAPE_POINTS = 41
+
+_ODD_SHAPE = 0.03
+"""Standard deviation of a stroke's shape from the usual one, as a share of its rise, from which on
+it is another motion: a rest of a tenth of its duration makes 0.04."""
+
+_ODD_NOISE = 3.0
+"""Standard deviations of the height's noise that a shape may differ by."""
+
+_SLOW_M_PER_S = 5e-3
+"""Peak speed up to which a single cycle is a step: the force is then one of seal and gas alone."""
+
+_SINGLE_SHARE = 0.03
+"""Share of the stroke by which a single cycle may differ from a sine."""
+
 _FEWEST_UNLIKE_A_SERIES = 4
 """Strokes of a motion that is no Fourier series: two of each direction, to hold against each other.
 """
@@ -106,11 +122,15 @@ class BlockMotion(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Like strokes in a row, alternately up and down: samples from `begin` to before `end`."""
+    """Like strokes in a row, alternately up and down: samples from `begin` to before `end`.
+
+    A single cycle has one whole stroke, and half a stroke before and after it.
+    """
 
     strokes: tuple[Stroke, ...]
     begin: int
     end: int
+    cycles: float
 
 
 def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
@@ -150,20 +170,86 @@ def _turns(height_m: Array, least_m: float) -> Iterator[int]:
         yield high if rising else low
 
 
-def find_blocks(strokes: list[Stroke]) -> list[Block]:
-    """Blocks of a record: at least three like strokes in a row."""
-    blocks: list[Block] = []
+def find_blocks(t_s: Array, height_m: Array, strokes: list[Stroke]) -> list[Block]:
+    """Blocks of a record: at least three like strokes in a row, or a single slow cycle.
+
+    Times, increasing, and heights have the shape (N,).
+    """
+    runs = [
+        _without_ramps(part)
+        for run in _find_runs(strokes)
+        for part in _split_by_shape(t_s, height_m, run)
+    ]
+    blocks = [Block(tuple(r), r[0].first, r[-1].last + 1, 0.5 * len(r)) for r in runs]
+    used = {stroke.first for run in runs for stroke in run}
+    singles = [
+        single
+        for stroke in strokes
+        if stroke.first not in used
+        if (single := _single_cycle(t_s, height_m, stroke)) is not None
+    ]
+    return sorted([*blocks, *singles], key=lambda block: block.begin)
+
+
+def _find_runs(strokes: list[Stroke]) -> list[list[Stroke]]:
+    """Strokes of one amplitude and duration in a row, three at least."""
+    runs: list[list[Stroke]] = []
     run: list[Stroke] = []
     for stroke in [*strokes, Stroke(-1, -1, 0.0, 0.0)]:
         if run and not _is_alike(run, stroke):
             if len(run) >= _FEWEST_STROKES:
-                kept = _without_ramps(run)
-                blocks.append(Block(tuple(kept), kept[0].first, kept[-1].last + 1))
+                runs.append(run)
             # A stroke that a machine changes its step in may have been like the next by chance.
             keeps = len(run) < _FEWEST_STROKES and _is_alike(run[-1:], stroke)
             run = run[-1:] if keeps else []
         run.append(stroke)
-    return blocks
+    return runs
+
+
+def _split_by_shape(t_s: Array, height_m: Array, run: list[Stroke]) -> Iterator[list[Stroke]]:
+    """Parts of a run between strokes whose shape is not the usual one, three strokes at least."""
+    if len(run) < _FEWEST_UNLIKE_A_SERIES:
+        yield run
+        return
+    apart = np.zeros(len(run))
+    for side in (slice(0, None, 2), slice(1, None, 2)):
+        shapes = np.array([_shape(t_s, height_m, stroke) for stroke in run[side]])
+        apart[side] = np.std(shapes - np.median(shapes, axis=0), axis=1)
+    usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
+    largest = max(_ODD_SHAPE, _ODD_NOISE * _noise_m(height_m) / usual_m)
+    part: list[Stroke] = []
+    for stroke, is_odd in zip([*run, run[-1]], [*(apart > largest), True], strict=True):
+        if not is_odd:
+            part.append(stroke)
+            continue
+        if len(part) >= _FEWEST_STROKES:
+            yield part
+        part = []
+
+
+def _shape(t_s: Array, height_m: Array, stroke: Stroke) -> Array:
+    """Heights over the duration of a stroke, as shares of its rise, shape (41,)."""
+    share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
+    at_s = t_s[stroke.first] + share * stroke.duration_s
+    heights = np.asarray(np.interp(at_s, t_s, height_m), np.float64)
+    return (heights - height_m[stroke.first]) / stroke.rise_m
+
+
+def _single_cycle(t_s: Array, height_m: Array, stroke: Stroke) -> Block | None:
+    """A slow cycle of a sine about one whole stroke, with half a stroke before and after it."""
+    if np.pi * abs(stroke.rise_m) / (2.0 * stroke.duration_s) > _SLOW_M_PER_S:
+        return None
+    begin_s = float(t_s[stroke.first]) - 0.5 * stroke.duration_s
+    end_s = float(t_s[stroke.last]) + 0.5 * stroke.duration_s
+    if begin_s < t_s[0] or end_s > t_s[-1]:
+        return None
+    begin, end = (int(i) for i in np.searchsorted(t_s, (begin_s, end_s)))
+    middle_m = 0.5 * (height_m[stroke.first] + height_m[stroke.last])
+    angle = np.pi * (t_s[begin:end] - t_s[stroke.first]) / stroke.duration_s
+    sine_m = middle_m - 0.5 * stroke.rise_m * np.cos(angle)
+    if float(np.abs(height_m[begin:end] - sine_m).max()) > _SINGLE_SHARE * abs(stroke.rise_m):
+        return None
+    return Block((stroke,), begin, end, 1.0)
 
 
 def _without_ramps(run: list[Stroke]) -> list[Stroke]:
