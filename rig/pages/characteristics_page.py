@@ -10,7 +10,7 @@ from rig.dyno.comparison import Difference, compare_dampers
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import Figure
 from rig.dyno.tolerance import PointVerdict
-from rig.pages.damper_pictures import VERDICT_MARKS, draw_damper
+from rig.pages.damper_pictures import VERDICT_MARKS, draw_account, draw_damper
 from rig.pages.html import render_report, write_page
 from rig.pages.identity import identity_rows
 from rig.pages.number_formats import (
@@ -90,6 +90,7 @@ def write_characteristics_page(
         stamp=None if worst is None else _STAMPS[worst],
         findings=[find(report) for report in reports],
         pictures=draw_damper(reports),
+        draw_account=draw_account,
         points=_urgent_points(first.points) if len(reports) == 1 else [],
         further_points=max(0, len(first.points) - _MOST_POINTS),
         properties=property_rows(first) if len(reports) == 1 else [],

@@ -44,6 +44,9 @@ VERDICT_MARKS = {
     "not measured": VerdictMark("#52606d", "|", "–"),
 }
 
+_USES = {"step": "#0072b2", "rest": "#52606d", "rejected": "#b3261e", "transition": ""}
+"""Colour behind what a part of a record was used for; empty for none."""
+
 _STYLE = {
     "axes.grid": True,
     "grid.alpha": 0.3,
@@ -55,6 +58,9 @@ _STYLE = {
 }
 _MOST_SAMPLES = 4000
 """Samples that are drawn behind the mean curves: more would not be told apart."""
+
+_PARTS = 900
+"""Parts of a record of which the least and the largest value are drawn: its width in px."""
 
 _LABEL_SPACE = 0.055
 """Share of an axis within which a second label is left out."""
@@ -90,6 +96,40 @@ def draw_damper(reports: Sequence[DamperReport]) -> dict[str, DamperPictures]:
     Band and master are the first one's.
     """
     return {system: _draw_in(units, reports) for system, units in SYSTEMS.items()}
+
+
+def draw_account(item: Characteristics) -> dict[str, str]:
+    """Height and force of a record with what each second was used for, by system of units."""
+    found: dict[str, str] = {}
+    for system, units in SYSTEMS.items():
+        with new_figure((9.0, 2.6), _STYLE) as figure:
+            upper, lower = figure.subplots(2, 1, sharex=True)
+            _draw_channel(upper, item, item.record.height_m * units.displacement[0])
+            _draw_channel(lower, item, item.record.force_n * units.force[0])
+            upper.set(ylabel=f"height / {units.displacement[1]}")
+            lower.set(ylabel=f"force / {units.force[1]}", xlabel="time / s")
+            for span in item.account:
+                if span.use == "step":
+                    middle_s = 0.5 * (span.begin_s + span.end_s)
+                    at = {"xycoords": ("data", "axes fraction"), "ha": "center", "fontsize": 7.5}
+                    upper.annotate(str(span.number), (middle_s, 1.02), **at)
+            found[system] = svg_url(figure)
+    return found
+
+
+def _draw_channel(axes: Any, item: Characteristics, values: Array) -> None:
+    """A channel over time, thinned by minimum and maximum, over the uses of the record."""
+    t_s = item.record.t_s
+    size = max(1, len(t_s) // _PARTS)
+    count = len(t_s) // size * size
+    parts = values[:count].reshape(-1, size)
+    both = np.column_stack([parts.min(axis=1), parts.max(axis=1)]).ravel()
+    axes.plot(np.repeat(t_s[:count:size], 2), both, color=RECORD_COLOURS[0], linewidth=0.6)
+    for span in item.account:
+        colour = _USES[span.use]
+        if colour:
+            axes.axvspan(span.begin_s, span.end_s, color=colour, alpha=0.22, linewidth=0.0)
+    axes.set_xlim(float(t_s[0]), float(t_s[-1]))
 
 
 def _draw_in(units: PlotUnits, reports: Sequence[DamperReport]) -> DamperPictures:

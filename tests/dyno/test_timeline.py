@@ -1,5 +1,6 @@
 """Every second of a test day is accounted for, and no step is lost between rests."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_the_whole_record_is_accounted_for(rest_s):
     spans = found.account
     assert spans[0].begin_s == t_s[0]
     assert spans[-1].end_s == t_s[-1]
-    assert all(a.end_s == b.begin_s for a, b in zip(spans, spans[1:], strict=False))
+    assert all(a.end_s == b.begin_s for a, b in itertools.pairwise(spans))
     steps = [span for span in spans if span.use == "step"]
     assert [span.number for span in steps] == [1, 2, 3]
     for span, step in zip(steps, found.steps, strict=True):
