@@ -215,7 +215,7 @@ def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> 
     from rig.tuning.tune import settings_of
 
     chosen, expectation = strut.tuned, strut.expectation
-    _print_errors(strut)
+    _print_errors(strut, damping_ratio)
     rms_n = float(expectation.power_n2.sum()) ** 0.5
     print_text(
         f"Height: noise {1e6 * expectation.noise_std_m:.3g} µm. Residual force: {rms_n:.3g} N RMS "
@@ -223,10 +223,11 @@ def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> 
     )
     if expectation.by_late_force_n > _WORTH_A_LINE * rms_n:
         print_text(
-            f"Of it, {expectation.by_late_force_n:.3g} N RMS are proportional to the rate of the "
-            "applied force, which acts later in the loop than the height. `rig diagnose` "
-            "and `rig evaluate` use the times of the samples and do not contain this part. A "
-            "shorter cycle of its message reduces it."
+            f"A part of it, {expectation.by_late_force_n:.3g} N RMS"
+            f"{' (other parts compensate it in part)' * (expectation.by_late_force_n > rms_n)}, is "
+            "proportional to the rate of the applied force, which acts later in the loop than the "
+            "height. `rig diagnose` and `rig evaluate` use the times of the samples and do not "
+            "contain this part. A shorter cycle of its message reduces it."
         )
     if strut.latency is not None:
         _print_latency(strut.latency, force_cycle_ms, is_set=bool(strut.delay_s))
@@ -293,8 +294,8 @@ def _print_latency(latency: "Latency", force_cycle_ms: float, *, is_set: bool) -
         )
 
 
-def _print_errors(strut: "TunedStrut") -> None:
-    from rig.tuning.gains import PAPER_HZ
+def _print_errors(strut: "TunedStrut", damping_ratio: float) -> None:
+    from rig.tuning.gains import LEAST_IN_MOTION, PAPER_HZ
 
     errors = strut.tuned.expected, strut.configured, strut.published
     rows = [
@@ -305,8 +306,11 @@ def _print_errors(strut: "TunedStrut") -> None:
     in_motion = strut.tuned.in_motion, *strut.others_in_motion
     rows += [
         ("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", "", f"{PAPER_HZ:.3g} Hz"),
-        ("least damping ratio", *(f"{error.damping_ratio:.3f}" for error in errors)),
-        ("least damping ratio in motion", *(_damping_text(it) for it in in_motion)),
+        (
+            f"least damping ratio (≥ {damping_ratio:g})",
+            *(f"{error.damping_ratio:.3f}" for error in errors),
+        ),
+        (f"the same in motion (≥ {LEAST_IN_MOTION:g})", *(_damping_text(it) for it in in_motion)),
         ("settling time", *(_time_text(error.settling_s) for error in errors)),
         ("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "", ""),
     ]

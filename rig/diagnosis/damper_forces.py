@@ -32,8 +32,9 @@ _STEPS = (1.0, 2.0, 3.0, 5.0)
 _DECADES = 1.3
 """Decades below the largest speed that a table covers: slower, dry friction hides the valves."""
 
-_REACHED = 0.99
-"""Share of the time in which a direction's largest speed of the table is not exceeded."""
+_REACHED = 0.999
+"""Share of the time in which a direction's largest speed of the table is not exceeded: where few
+samples reach it, its interval shows that."""
 
 _NEAR = 0.02
 """Distance of the two speeds between which a slope is taken, as a share of the speed."""
