@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rig.dyno.figures import SIDES, DynoStep
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
-from rig.dyno.strokes import Array
+from rig.dyno.knee import find_knee
+from rig.dyno.stroke_force import Figure, student_factor
 
 _ALIKE_SPEED = 0.05
 """Relative difference of speed and amplitude up to which steps are repetitions of each other."""
@@ -17,16 +17,6 @@ _LEAST_WARMING_K = 2.0
 
 _WARM_UP = 2.0
 """Ratio of the first step's cycles to those of the others, from which it is a warm-up."""
-
-_DRAWS = 300
-"""Random curves for the interval of a knee, which determine its ends to a tenth."""
-
-_STRAIGHT = 1.25
-"""Ratio of the slopes below and above, under which there is no knee."""
-
-_KNEE_POINTS = 60
-_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE = 0.05, 0.9
-"""Shares of the peak speed between which a knee is searched."""
 
 _FEWEST_STROKES = 6
 """Fewest strokes for a change per kelvin."""
@@ -40,6 +30,7 @@ class Damper(NamedTuple):
         gas_rate_n_per_m: Its rise per compression there.
         friction_n: Half the difference of both directions there.
         knee_m_per_s: By direction the speed at which the curve bends.
+        slopes_n_s_per_m: By direction with a knee the slopes below and above it.
         asymmetry: Rebound over compression at peak velocity of the fastest step, without gas.
         force_per_kelvin_n_per_k: By direction the change of force per kelvin.
         notes: Why a figure is missing, and what was assumed.
@@ -49,6 +40,7 @@ class Damper(NamedTuple):
     gas_rate_n_per_m: Figure | None
     friction_n: Figure | None
     knee_m_per_s: dict[str, Figure | None]
+    slopes_n_s_per_m: dict[str, tuple[Figure, Figure]]
     asymmetry: Figure | None
     force_per_kelvin_n_per_k: dict[str, Figure | None]
     notes: tuple[str, ...]
@@ -91,19 +83,23 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
             "asymmetry is that of whole forces"
         )
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
-    knee = {name: _knee(stroke) for name, stroke in zip(SIDES, fastest.strokes, strict=True)}
-    if any(stroke.is_constant for stroke in fastest.strokes):
-        notes.append("no knee: the fastest step has a single speed")
-    elif not any(knee.values()):
-        notes.append("no knee: the curve of the fastest step is straight within its noise")
-    per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(knee)}
+    usual = [step for step in steps if step.kind != "warm_up"] or steps
+    knee = {
+        name: find_knee([step.strokes[index] for step in usual]) for index, name in enumerate(SIDES)
+    }
+    if not any(knee.values()):
+        is_single = len(usual) == 1 and any(stroke.is_constant for stroke in usual[0].strokes)
+        why = "the test has a single speed" if is_single else "force over speed has no bend in it"
+        notes.append(f"no knee: {why}")
+    per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(SIDES)}
     if not any(per_kelvin.values()):
         notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
     return Damper(
         gas_force,
         gas_rate,
         friction,
-        knee,
+        {name: None if it is None else it.speed_m_per_s for name, it in knee.items()},
+        {name: (it.below_n_s_per_m, it.above_n_s_per_m) for name, it in knee.items() if it},
         _asymmetry(fastest, gas_force),
         per_kelvin,
         tuple(notes),
@@ -137,67 +133,6 @@ def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     half = ratio * float(np.linalg.norm(parts))
     of = "whole force" if gas is None else "force less gas force"
     return Figure(ratio, ratio - half, ratio + half, f"{of} at peak velocity, fastest step")
-
-
-def _knee(stroke: MeanStroke) -> Figure | None:
-    """Speed where two straight lines through the curve meet; interval from random curves."""
-    if stroke.is_constant:
-        return None  # a single speed has no curve
-    speed = np.abs(stroke.velocity_m_per_s)
-    peak = float(speed.max())
-    grid = np.linspace(0.03, 0.99, _KNEE_POINTS) * peak
-    top = int(np.argmax(speed))
-    if not 0 < top < len(speed) - 1:
-        return None
-    # Mean of both halves of the stroke, in which lag and spring cancel.
-    rows = np.array(
-        [
-            0.5 * (_force_row_at(speed[: top + 1], v, 0) + _force_row_at(speed[top:], v, top))
-            for v in grid
-        ]
-    )
-    tried = np.linspace(_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE, 2 * _KNEE_POINTS) * peak
-    bases = [np.column_stack([np.ones_like(grid), grid, np.maximum(grid - v, 0.0)]) for v in tried]
-    solvers = [np.linalg.pinv(base) for base in bases]
-
-    def best_knee(force_n: Array) -> tuple[float, float]:
-        curve = rows @ force_n
-        squares = [
-            float(np.sum((curve - base @ (solver @ curve)) ** 2))
-            for base, solver in zip(bases, solvers, strict=True)
-        ]
-        best = int(np.argmin(squares))
-        _, below, bend = solvers[best] @ curve
-        above = below + bend
-        steep, flat = max(abs(below), abs(above)), min(abs(below), abs(above))
-        return float(tried[best]), steep / max(flat, 1e-12)
-
-    value, ratio = best_knee(stroke.force_n)
-    if ratio < _STRAIGHT:
-        return None
-    rng = np.random.default_rng(0)
-    values, vectors = np.linalg.eigh(stroke.covariance)
-    spread = vectors * np.sqrt(np.clip(values, 0.0, None))
-    drawn = [
-        best_knee(stroke.force_n + spread @ rng.standard_normal(len(values))) for _ in range(_DRAWS)
-    ]
-    if np.mean([item[1] < _STRAIGHT for item in drawn]) > 0.05:
-        return None
-    step = float(tried[1] - tried[0])
-    low, high = np.percentile([item[0] for item in drawn], (2.5, 97.5))
-    low, high = min(float(low), value) - step, max(float(high), value) + step
-    return Figure(value, low, high, "two straight lines through force over speed, fastest step")
-
-
-def _force_row_at(speed: Array, value: float, offset: int) -> Array:
-    """Row over the angles that gives the force where a half stroke has a speed."""
-    order = np.argsort(speed)
-    position = float(np.interp(value, speed[order], order.astype(np.float64)))
-    before = min(int(position), len(speed) - 2)
-    row = np.zeros(len(ANGLES))
-    row[offset + before] = 1.0 - (position - before)
-    row[offset + before + 1] = position - before
-    return row
 
 
 def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:

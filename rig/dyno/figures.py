@@ -213,7 +213,8 @@ def _warmth(
     if warm_c is None or not central.any():
         return np.empty(0), np.empty(0)
     more_n = force_n[central] - stroke.row(np.arcsin(position[central])) @ stroke.force_n
-    middle_n = float((stroke.row(0.0) @ stroke.force_n)[0])
+    about = np.arcsin(np.linspace(-_CENTRAL, _CENTRAL, 41))
+    middle_n = float(np.mean(stroke.row(about) @ stroke.force_n))
     numbers = number[central]
     of_stroke = [numbers == n for n in np.unique(numbers)]
     return (

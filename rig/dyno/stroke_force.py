@@ -25,8 +25,15 @@ from scipy.special import stdtrit  # pyright: ignore[reportUnknownVariableType]
 from rig.dyno.strokes import Array, BlockMotion
 
 _DEGREE = 3
-_PIECES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+_PIECES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 72, 108, 160)
 """Pieces of a spline that are tried; none is the linear strut alone."""
+
+_FEWEST_IN_A_PIECE = 4
+"""Samples of a piece, which has four coefficients: a spline without them is free there."""
+
+_FOLLOWS_A_SINE = 8
+"""Pieces from which on a spline follows a sine to 1e-4 of it: sine and cosine as further columns
+would be linear combinations of its own."""
 
 _UNDERSMOOTHED = 1
 """Steps by which the spline is more flexible than the best for the curve itself: the best curve has
@@ -42,6 +49,9 @@ Without it 93 to 96 % of the intervals held the truth over 240 dynos at random
 
 _WORST_CONDITION = 1e10
 """Of the normal equations: beyond it the samples leave a part of the stroke open."""
+
+_MOST_LEVERAGE = 1.0
+"""Variance of a spline at any angle over that of a sample: beyond it the spline extrapolates."""
 
 _COVERAGE = 0.95
 _FEWEST_CLUSTERS = 4
@@ -213,7 +223,7 @@ def _mean_velocity(theta: Array, velocity_m_per_s: Array) -> Array:
 
 
 def _design(theta: Array, pieces: int) -> Array:
-    """Columns at angles: what a linear strut has under a sine, and the spline."""
+    """Columns at angles: the spline, and with few pieces what a linear strut has under a sine."""
     sine, cosine = np.sin(theta), np.cos(theta)
     if not pieces:
         return np.column_stack([np.ones_like(theta), sine, cosine])
@@ -221,7 +231,7 @@ def _design(theta: Array, pieces: int) -> Array:
     inner = np.linspace(-half, half, pieces + 1)
     knots = np.concatenate([[-half] * _DEGREE, inner, [half] * _DEGREE])
     spline: Array = BSpline.design_matrix(theta, knots, _DEGREE).toarray()
-    return np.column_stack([spline, sine, cosine])
+    return np.column_stack([spline, sine, cosine]) if pieces < _FOLLOWS_A_SINE else spline
 
 
 class _Fit(NamedTuple):
@@ -253,10 +263,17 @@ def _fit_spline(
     count, size = design.shape
     if angles < size + (pieces > 0) or count < 2 * size:
         return None
+    edges = np.linspace(-0.5 * np.pi, 0.5 * np.pi, max(pieces, 1) + 1)
+    if int(np.histogram(theta, edges)[0].min()) < _FEWEST_IN_A_PIECE:
+        return None
     gram = design.T @ design
     if np.linalg.cond(gram) > _WORST_CONDITION:
         return None
     inverse: Array = np.linalg.inv(gram).astype(np.float64)
+    if pieces >= _FOLLOWS_A_SINE:
+        rows = _design(ANGLES, pieces)
+        if float(np.einsum("ij,jk,ik->i", rows, inverse, rows).max()) > _MOST_LEVERAGE:
+            return None
     weights = inverse @ (design.T @ force_n)
     residual_n = force_n - design @ weights
     squares = float(residual_n @ residual_n)

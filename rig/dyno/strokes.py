@@ -54,6 +54,10 @@ _ODD_NOISE = 3.0
 _SLOW_M_PER_S = 5e-3
 """Peak speed up to which a single cycle is a step: the force is then one of seal and gas alone."""
 
+_HALF = 0.49
+"""Of a stroke that is taken before and after the whole one of a single cycle: not all, because
+the machine rests where it begins and ends."""
+
 _SINGLE_SHARE = 0.03
 """Share of the stroke by which a single cycle may differ from a sine."""
 
@@ -239,8 +243,8 @@ def _single_cycle(t_s: Array, height_m: Array, stroke: Stroke) -> Block | None:
     """A slow cycle of a sine about one whole stroke, with half a stroke before and after it."""
     if np.pi * abs(stroke.rise_m) / (2.0 * stroke.duration_s) > _SLOW_M_PER_S:
         return None
-    begin_s = float(t_s[stroke.first]) - 0.5 * stroke.duration_s
-    end_s = float(t_s[stroke.last]) + 0.5 * stroke.duration_s
+    begin_s = float(t_s[stroke.first]) - _HALF * stroke.duration_s
+    end_s = float(t_s[stroke.last]) + _HALF * stroke.duration_s
     if begin_s < t_s[0] or end_s > t_s[-1]:
         return None
     begin, end = (int(i) for i in np.searchsorted(t_s, (begin_s, end_s)))

@@ -213,6 +213,11 @@ def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
     """Figures over all steps and at rest: name, value, interval and method."""
     named = [(name, it, unit) for name, (unit, it) in item.damper.properties().items()]
     named += [
+        (f"slope {where} the knee, {side}", figure, "N·s/m")
+        for side, both in item.damper.slopes_n_s_per_m.items()
+        for where, figure in zip(("below", "above"), both, strict=True)
+    ]
+    named += [
         (f"change per kelvin, {side}", figure, "N/K")
         for side, figure in item.damper.force_per_kelvin_n_per_k.items()
         if figure is not None

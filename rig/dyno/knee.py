@@ -1,0 +1,136 @@
+"""Knee and slopes of a damper's force over speed, from all steps together.
+
+Force over speed is described by two straight lines that meet at the knee, where the valves open.
+Each step gives the force at the speeds that its strokes pass through, as the mean of speeding up
+and slowing down, in which a spring and a small lag cancel. Slow steps determine the line below the
+knee, fast ones the line above; the covariances of the mean strokes are their weights.
+
+Reference: Seber and Wild, Nonlinear Regression (1989), 9, for segmented regression and the interval
+of a joint from the sum of squares.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke
+from rig.dyno.strokes import Array
+
+_STRAIGHT = 1.25
+"""Ratio of the slopes below and above, under which there is no knee."""
+
+_CHANCE = 10.83
+"""Fall of the sum of squares by a bend that straight curves reach once in a thousand (chi-squared
+with one degree of freedom)."""
+
+_QUANTILE = 3.84
+"""Rise of the sum of squares at the ends of a 95 % interval."""
+
+_SHARES = np.geomspace(0.04, 0.985, 32)
+"""Speeds of a stroke, as shares of its largest."""
+
+_SLOWEST_M_PER_S, _LEAST_SHARE = 5e-3, 0.5
+"""Speed, or share of the largest one if that is slower, below which dry friction that builds up
+over a travel takes part."""
+
+_MISFIT = 0.003
+"""Share of the largest force by which a mean curve may bend between the samples of its strokes."""
+
+_KNEES = 240
+_LOWEST, _HIGHEST = 1.15, 0.9
+"""Times the slowest and share of the fastest speed between which a knee is searched."""
+
+
+class Knee(NamedTuple):
+    """Where force over speed bends, and its slopes below and above it, in N·s/m."""
+
+    speed_m_per_s: Figure
+    below_n_s_per_m: Figure
+    above_n_s_per_m: Figure
+
+
+def find_knee(strokes: Sequence[MeanStroke]) -> Knee | None:
+    """The knee of one direction, from the mean strokes of its steps; None where there is none."""
+    points = [_points(stroke) for stroke in strokes]
+    speeds = np.concatenate([item[0] for item in points])
+    fastest, slowest = float(speeds.max()), float(speeds.min())
+    floor_n = _MISFIT * max(float(np.abs(item[1]).max()) for item in points)
+    rows: list[tuple[Array, Array]] = []
+    for speed, force_n, covariance in points:
+        lower = np.linalg.cholesky(covariance + floor_n**2 * np.eye(len(speed)))
+        rows.append((np.asarray(np.linalg.inv(lower), np.float64), force_n))
+    whitened = np.concatenate([inverse @ force_n for inverse, force_n in rows])
+
+    def squares(knee: float | None) -> tuple[float, Array, Array]:
+        bases: list[Array] = []
+        for (inverse, _), (speed, *_) in zip(rows, points, strict=True):
+            base = [np.ones_like(speed), speed]
+            base += [] if knee is None else [np.maximum(speed - knee, 0.0)]
+            bases.append(inverse @ np.column_stack(base))
+        design = np.concatenate(bases)
+        weights = np.asarray(np.linalg.lstsq(design, whitened, rcond=None)[0], np.float64)
+        residual = whitened - design @ weights
+        return float(residual @ residual), weights, design
+
+    tried = np.geomspace(_LOWEST * slowest, _HIGHEST * fastest, _KNEES)
+    freedom = len(whitened) - 4
+    if freedom < 1 or tried[-1] <= tried[0]:
+        return None
+    sums = np.array([squares(float(knee))[0] for knee in tried])
+    best = int(np.argmin(sums))
+    scale = max(1.0, float(sums[best]) / freedom)
+    _, weights, design = squares(float(tried[best]))
+    below, above = float(weights[1]), float(weights[1] + weights[2])
+    steep, flat = max(abs(below), abs(above)), min(abs(below), abs(above))
+    gain = (squares(None)[0] - float(sums[best])) / scale
+    if gain < _CHANCE or steep < _STRAIGHT * flat:
+        return None
+    inside = tried[sums <= sums[best] + _QUANTILE * scale]
+    step = float(tried[1] / tried[0])
+    method = f"two straight lines through force over speed, {len(strokes)} steps"
+    knee = Figure(
+        float(tried[best]), float(inside.min()) / step, float(inside.max()) * step, method
+    )
+    covariance = np.asarray(scale * np.linalg.pinv(design.T @ design), np.float64)
+    slopes = [
+        _slope(row, weights, covariance, sign=strokes[0].sign)
+        for row in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0]))
+    ]
+    return Knee(knee, *slopes)
+
+
+def _slope(row: Array, weights: Array, covariance: Array, *, sign: int) -> Figure:
+    """A slope, positive for a damper."""
+    value, half = -sign * float(row @ weights), 1.96 * float(np.sqrt(row @ covariance @ row))
+    return Figure(value, value - half, value + half, "line on its side of the knee")
+
+
+def _points(stroke: MeanStroke) -> tuple[Array, Array, Array]:
+    """Speeds of a stroke, forces there, and their covariance."""
+    speed = np.abs(stroke.velocity_m_per_s)
+    top = int(np.argmax(speed))
+    if stroke.is_constant or not 0 < top < len(speed) - 1:
+        at, rows = np.array([float(speed[len(speed) // 2])]), stroke.row(0.0)
+    else:
+        peak = float(speed[top])
+        at = _SHARES * peak
+        at = at[at >= min(_SLOWEST_M_PER_S, _LEAST_SHARE * peak)]
+        rows = np.array(
+            [
+                0.5 * (_row_at(speed[: top + 1], v, 0) + _row_at(speed[top:], v, top))
+                for v in at.tolist()
+            ]
+        )
+    return at, rows @ stroke.force_n, rows @ stroke.covariance @ rows.T
+
+
+def _row_at(speed: Array, value: float, offset: int) -> Array:
+    """Row over the angles that gives the force where a half stroke has a speed."""
+    order = np.argsort(speed)
+    position = float(np.interp(value, speed[order], order.astype(np.float64)))
+    before = min(int(position), len(speed) - 2)
+    row = np.zeros(len(ANGLES))
+    row[offset + before] = 1.0 - (position - before)
+    row[offset + before + 1] = position - before
+    return row
