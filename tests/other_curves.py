@@ -26,16 +26,17 @@ FIGURES = (
     "force error (RMS) relative to the peak, %",
     "peak force, N",
 )
-TEXT = """
+TEXT =
+"""
 Cuesta, Luque and Mantaras (2021) published the [method](../explanation/method.md), but not the
-curves of their spring and damper. The curves of the shipped reference bench were chosen so that the
-published errors result (2.5 mm of height and 1.14 % of the peak force). This page shows the errors
-with other curves: the slopes of the spring curve and of the damper curve are multiplied by a smooth
-factor, drawn at random between 0.5 and 2. Observer and model are those of the reference case. Each
-bench runs in lockstep for 20 s, and its values are encoded in CAN frames; the first {settled_s:g} s
-are not evaluated. An error is the model's height, or the estimated force, less that of the
-simulated bench. The peak force is the largest magnitude of the simulated strut force in the
-evaluated time.
+curves of their spring and damper. The curves of the shipped reference bench were chosen so that
+errors close to the published ones result (2.5 mm of height and 1.14 % of the peak force). This page
+shows the errors with other curves: the slopes of the spring curve and of the damper curve are
+multiplied by a smooth factor, drawn at random between 0.5 and 2. Observer and model are those of
+the reference case. Each bench runs in lockstep for 20 s, and its values are encoded in CAN frames;
+the first {settled_s:g} s are not evaluated. An error is the model's height, or the estimated force,
+less that of the simulated bench. The peak force is the largest magnitude of the simulated strut
+force in the evaluated time.
 """
 
 

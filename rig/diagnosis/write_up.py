@@ -66,6 +66,9 @@ _FAR = 3.0
 _STANDSTILL = 0.02
 """Share of the speed that is exceeded in a twentieth of the time, below which a strut rests."""
 
+_SHORTEST_REST_S = 0.3
+"""Time in standstill from which on a strut rests: it passes a turning point in less."""
+
 _LEAST_REST = 0.05
 """Share of the time from which on rests, or motion, are worth a note."""
 
@@ -471,9 +474,10 @@ def _notes_of_standstill(
             break
         force_n = np.concatenate([forces.force_n[index] for forces in known])
         velocity = np.concatenate([f.track.velocities_m_per_s[index] for f in known])
+        t_s = np.concatenate([forces.track.t_s for forces in known])
         is_known = np.isfinite(force_n)
-        speed, force_n = np.abs(velocity[is_known]), force_n[is_known]
-        rests = speed < _STANDSTILL * float(np.quantile(speed, 0.95)) if len(speed) else speed > 0.0
+        speed, force_n, t_s = np.abs(velocity[is_known]), force_n[is_known], t_s[is_known]
+        rests = find_rests(t_s, speed)
         if not _LEAST_REST < float(np.mean(rests)) < 1.0 - _LEAST_REST:
             continue
         at_rest_n, moving_n = rms(force_n[rests]), rms(force_n[~rests])
@@ -485,6 +489,18 @@ def _notes_of_standstill(
                 "recording of motion alone evaluates the other laws better."
             )
     return tuple(notes)
+
+
+def find_rests(t_s: Array, speed_m_per_s: Array) -> NDArray[np.bool_]:
+    """Samples at which a strut stands still, all of shape (N,): not those of a turning point."""
+    if not len(t_s):
+        return np.zeros(0, np.bool_)
+    is_slow = speed_m_per_s < _STANDSTILL * float(np.quantile(speed_m_per_s, 0.95))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_slow, [0]])))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if t_s[end - 1] - t_s[begin] < _SHORTEST_REST_S:
+            is_slow[begin:end] = False
+    return is_slow
 
 
 def _notes_of_friction_like_laws(

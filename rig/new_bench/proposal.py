@@ -181,7 +181,9 @@ def find_height(database: Database, named: str | None) -> Choice:
         return replace(_choice(HEIGHT, fine[0], ranked), why=why)
     lengths = ", ".join(item.name for item in ranked[:_MOST_OTHERS])
     more = ", ..." if len(ranked) > _MOST_OTHERS else ""
-    counts = unknown_units(database)[:_MOST_OTHERS]
+    counts = unknown_units(database)
+    counts += [it for it in words_without_unit(messages, signal_ranking.HEIGHT) if it not in counts]
+    counts = counts[:_MOST_OTHERS]
     unknown = f"; {' or '.join(counts)} has no unit that is known" if counts else ""
     raise InputError(
         f"{database.path}: no length looks like the height of a strut (there are {lengths}"

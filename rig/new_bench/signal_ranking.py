@@ -97,7 +97,8 @@ HEIGHT = Likeness(
     _weights(
         plus_3="susp suspension damper daempfer shock strut stroke lvdt drawwire linpot federweg "
         "einfederung federbein ridehgt rideheight ride wire potentiometer pot jounce",
-        plus_2="height hght hoehe travel displacement displ stringpot weg wegsensor level niveau",
+        plus_2="height hght hoehe hauteur hoogte altura altezza travel displacement displ "
+        "stringpot weg wegsensor level niveau",
         plus_1="pos position length laenge hub spring feder corner axle achse encoder enc",
         minus_4="odo odometer trip range reichweite altitude gps latitude longitude "
         "lane radar object obj target curve kurve snow rain urea fuel tank tire tyre circumference "

@@ -191,7 +191,8 @@ def one(job):
     return fault, [item.name for item in naming.named], naming, damper
 
 
-TEXT = """
+TEXT =
+"""
 `rig characterise --master` compares a damper with a good one in the same test, and names its fault.
 Here the dampers are simulated with equations other than those of the evaluation: a polytropic gas
 column, a damping law with a sharp knee and, for the faults of that name, aerated oil whose
@@ -199,13 +200,13 @@ stiffness rises with pressure, and free play as a contact.
 
 Gas force and friction, and, independently in rebound and compression, the damping below and above
 the knee and the speed of the knee scatter by {scatter:g} % (standard deviation) from damper to
-damper; the master is the nominal damper. Half of the dampers are good. Each of the others has one
-fault of a random size. No faults other than those in the table were tested. A damper counts as
-named correctly if the kind of fault is right; the direction in the name (compression, rebound or
-both) is not compared. The last column covers only these dampers: it counts those whose 95 %
-interval contains the true size of the fault. It is empty where there is no single true size: the
-compliance of the simulated aerated oil depends on the force, and a changed damping has slightly
-different changes below and above the knee, because both scatter independently.
+damper; the master is the nominal damper. As many dampers are good as have a fault (`--dampers` is
+the number of each); a fault is of a random size. No faults other than those in the table were
+tested. A damper counts as named correctly if the kind of fault is right; the direction in the name
+(compression, rebound or both) is not compared. The last column covers only these dampers: it counts
+those whose 95 % interval contains the true size of the fault. It is empty where there is no single
+true size: the compliance of the simulated aerated oil depends on the force, and a changed damping
+has slightly different changes below and above the knee, because both scatter independently.
 """
 
 PLANTED = {

@@ -213,7 +213,7 @@ def test_masquerade(row):
     row(
         7,
         "masquerade: another message's frames under the measurement's id",
-        "recognises the other message by its data id, refuses and counts its frames",
+        "refuses and counts the frames: their CRC was computed with another data id",
         first_ms(ticks, lambda tick: tick.counts.masquerade > 0),
         "the disguised frames",
     )
@@ -313,8 +313,9 @@ def test_stuck_value(row):
     row(
         11,
         "stuck value: the same height in valid frames (limit `unchanged_s: 0.02`)",
-        f"estimate invalid after {invalid_ms:.0f} ms, HOLD after {hold_ms:.0f} ms; refuses the "
-        "measurement once it has been the same for 20 ms; then the safe state",
+        f"estimate invalid after {invalid_ms:.0f} ms; HOLD after {hold_ms:.0f} ms, as no new "
+        "height has been used for 10 ms; refuses the measurement once it has been the same for "
+        "20 ms; the safe state 500 ms later",
         safe_ms,
         "the refused measurements",
     )

@@ -294,7 +294,8 @@ def test_slow_disk(row, tmp_path, monkeypatch):
     row(
         16,
         "slow disk: a write takes one second",
-        "no tick waits, because a separate thread writes; LOG_FAULT from 2 000 waiting ticks on",
+        "the loop does not wait, because a separate thread writes; LOG_FAULT once 2 000 ticks wait "
+        "in memory",
         "0 ms",
         "nothing",
     )
@@ -336,7 +337,7 @@ def test_sigkill(row, tmp_path):
         17,
         "SIGKILL",
         "the process ends; all frames but those of the last 10 ms are on the disk, and a replay "
-        f"computes the steps after the last batch (here {recomputed_ms:.0f} ms) from them",
+        f"computes from them the ticks that the log does not have (here {recomputed_ms:.0f} ms)",
         "0 ms",
         "frames of the last 10 ms",
     )

@@ -290,9 +290,9 @@ def test_linear_corrections_stand_apart_from_what_is_missing() -> None:
     text = shown(report(found(linear=corrections))).replace("\u00a0", " ")
     linear, missing = text.split("Linear part", 1)[1].split("Missing effects", 1)
     for part in (
-        "stiffness about mid-stroke (0.38 m)",
+        "stiffness about mid-stroke (380.0 mm)",
         "900 N/m 783 N/m 771 to 795 N/m 13 % below the given model's",
-        "preload about mid-stroke (0.38 m)",
+        "preload about mid-stroke (380.0 mm)",
         "0 N 12.30 N 11.90 to 12.70 N 12.3 N above the given model's",
         "damping damping_n_s_per_m 20.0 N·s/m 23.1 N·s/m not identifiable from these data "
         "16 % above",

@@ -74,7 +74,7 @@ def linear_label(item: LinearCorrection) -> str:
     name, _ = LINEAR[item.parameter]
     if item.about_height_m is None:
         return name
-    return f"{name} about mid-stroke ({number(item.about_height_m, 2)}\u00a0m)"
+    return f"{name} about mid-stroke ({number(1e3 * item.about_height_m, 1)}\u00a0mm)"
 
 
 def sentence(diagnosis: Diagnosis, struts: int) -> str:
