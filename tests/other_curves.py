@@ -26,8 +26,7 @@ FIGURES = (
     "force error (RMS) relative to the peak, %",
     "peak force, N",
 )
-TEXT =
-"""
+TEXT = """
 Cuesta, Luque and Mantaras (2021) published the [method](../explanation/method.md), but not the
 curves of their spring and damper. The curves of the shipped reference bench were chosen so that
 errors close to the published ones result (2.5 mm of height and 1.14 % of the peak force). This page

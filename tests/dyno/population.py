@@ -191,8 +191,7 @@ def one(job):
     return fault, [item.name for item in naming.named], naming, damper
 
 
-TEXT =
-"""
+TEXT = """
 `rig characterise --master` compares a damper with a good one in the same test, and names its fault.
 Here the dampers are simulated with equations other than those of the evaluation: a polytropic gas
 column, a damping law with a sharp knee and, for the faults of that name, aerated oil whose
