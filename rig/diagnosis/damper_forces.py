@@ -7,19 +7,21 @@ order, which includes that the parameters depend on one another.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C, Effect, effect
-from dart_model.effects.calling import force_over_arrays
+from dart_model.effects.calling import STRUT, force_over_arrays
 from rig.diagnosis.outcome import DamperForce, Estimate
 from rig.diagnosis.problem.problem import (
     Problem,
     ResidualForces,
     mid_stroke_m,
     slots_of,
+    strut_constants,
     strut_effects,
 )
 from rig.diagnosis.search.fit import Fit, FitCovariance, effect_variables
@@ -43,17 +45,18 @@ _STEP = 1e-4
 """Step of a finite difference, in units of a search variable (whose deviation is about one)."""
 
 
+_DAMPING = STRUT.index("damping_n_s_per_m")
+
+
 class Damper(NamedTuple):
     """What gives a strut's force over velocity.
 
     Attributes:
-        damping_n_s_per_m: Linear damping.
         laws: Laws of the damper, with their parameters.
-        constants: Free length, stiffness, damping and gravity, for laws that read them.
+        constants: Free length, stiffness, linear damping and gravity, which laws may read.
         height_m: Height at which laws that depend on it are evaluated.
     """
 
-    damping_n_s_per_m: float
     laws: Sequence[tuple[Effect, Sequence[float]]]
     constants: Sequence[float]
     height_m: float
@@ -61,7 +64,7 @@ class Damper(NamedTuple):
     def force_n(self, velocity_m_per_s: float) -> float:
         """Force, positive when it pushes the bodies apart: negative in rebound."""
         motion = 0.0, self.height_m, velocity_m_per_s, 0.0, AMBIENT_C
-        total = -self.damping_n_s_per_m * velocity_m_per_s
+        total = -self.constants[_DAMPING] * velocity_m_per_s
         for law, values in self.laws:
             total += force_over_arrays(law)(*motion, (), values, self.constants)
         return total
@@ -83,34 +86,35 @@ def damper_forces(
     after: Sequence[ResidualForces | None],
 ) -> tuple[DamperForce, ...]:
     """Forces of each strut whose damper is described by a law, at speeds that were reached."""
+    tracks = [forces.track for forces in after if forces is not None]
+    if not tracks:
+        return ()
     rows: list[DamperForce] = []
-    known = [forces.track for forces in after if forces is not None]
     for index, strut in enumerate(problem.spec.struts):
         described = _describe_damper(problem, fit, index)
-        if described is None or not known:
+        if described is None:
             continue
-        velocities = list_velocities(
-            np.concatenate([track.velocities_m_per_s[index] for track in known])
-        )
-
-        def figures(
-            values: Array,
-            described: Callable[[Array], Damper] = described,
-            velocities: Array = velocities,
-        ) -> Array:
-            return described(values).figures(velocities)
-
-        try:
-            values, halves = with_half_widths(figures, fit, covariance)
-        except (ArithmeticError, ValueError):  # a law without a value at this motion
-            continue
-        rows += [
-            DamperForce(
-                strut.name, float(v), *(_estimate(values[k, i], halves[k, i]) for k in (0, 1))
-            )
-            for i, v in enumerate(velocities)
-        ]
+        motion = np.concatenate([track.velocities_m_per_s[index] for track in tracks])
+        with suppress(ArithmeticError, ValueError):  # a law without a value at this motion
+            rows += _forces_of(strut.name, described, list_velocities(motion), fit, covariance)
     return tuple(rows)
+
+
+def _forces_of(
+    strut: str,
+    described: Callable[[Array], Damper],
+    velocities: Array,
+    fit: Fit,
+    covariance: FitCovariance,
+) -> list[DamperForce]:
+    """Forces of one damper, which the search variables describe."""
+    values, halves = with_half_widths(
+        lambda variables: described(variables).figures(velocities), fit, covariance
+    )
+    return [
+        DamperForce(strut, velocity, *(_estimate(values[k, i], halves[k, i]) for k in (0, 1)))
+        for i, velocity in enumerate(velocities.tolist())
+    ]
 
 
 def list_velocities(velocity_m_per_s: Array) -> Array:
@@ -164,31 +168,18 @@ def _describe_damper(problem: Problem, fit: Fit, strut: int) -> Callable[[Array]
     if not rows or any(law.states for _, law in rows):
         return None
     slots, variables = slots_of(problem, fit.candidate).each, effect_variables(problem, fit)
-    spec = problem.spec.struts[strut]
-    free = np.flatnonzero(fit.free)
-    damping_at = next(
-        (i for i, p in enumerate(problem.linear) if p.strut == strut and p.kind == "damping"),
-        None,
-    )
+    height_m = mid_stroke_m(problem.motions[strut])
+    free, given = np.flatnonzero(fit.free), fit.parts.effects
 
     def described(values: Array) -> Damper:
         linear = fit.parts.linear.copy()
         linear[free] = values[: len(free)]
-        damping = spec.damping_n_s_per_m
-        damping += float(linear[damping_at]) if damping_at is not None else 0.0
-        laws: list[tuple[Effect, Sequence[float]]] = []
-        for row, law in rows:
-            own = fit.parts.effects[slots[row].parameters].copy()
-            if row in variables:
-                own = values[variables[row]]
-            laws.append((law, own.tolist()))
-        constants = (
-            spec.free_length_m,
-            spec.stiffness_n_per_m,
-            damping,
-            problem.spec.gravity_m_per_s2,
-        )
-        return Damper(damping, laws, constants, mid_stroke_m(problem.motions[strut]))
+        constants = strut_constants(problem, linear)[strut, :4].tolist()
+        laws = [
+            (law, values[variables[row]] if row in variables else given[slots[row].parameters])
+            for row, law in rows
+        ]
+        return Damper([(law, own.tolist()) for law, own in laws], constants, height_m)
 
     return described
 

@@ -49,6 +49,7 @@ from rig.diagnosis.search.fit import (
     is_white,
 )
 from rig.diagnosis.search.model_selection import SearchResult
+from rig.recordings.stretches import find_stretches
 
 Array = NDArray[np.float64]
 
@@ -473,11 +474,13 @@ def _notes_of_standstill(
         if not known:
             break
         force_n = np.concatenate([forces.force_n[index] for forces in known])
-        velocity = np.concatenate([f.track.velocities_m_per_s[index] for f in known])
-        t_s = np.concatenate([forces.track.t_s for forces in known])
+        rests = np.concatenate(
+            [find_rests(f.track.t_s, np.abs(f.track.velocities_m_per_s[index])) for f in known]
+        )
         is_known = np.isfinite(force_n)
-        speed, force_n, t_s = np.abs(velocity[is_known]), force_n[is_known], t_s[is_known]
-        rests = find_rests(t_s, speed)
+        if not is_known.any():
+            continue
+        force_n, rests = force_n[is_known], rests[is_known]
         if not _LEAST_REST < float(np.mean(rests)) < 1.0 - _LEAST_REST:
             continue
         at_rest_n, moving_n = rms(force_n[rests]), rms(force_n[~rests])
@@ -493,13 +496,10 @@ def _notes_of_standstill(
 
 def find_rests(t_s: Array, speed_m_per_s: Array) -> NDArray[np.bool_]:
     """Samples at which a strut stands still, all of shape (N,): not those of a turning point."""
-    if not len(t_s):
-        return np.zeros(0, np.bool_)
     is_slow = speed_m_per_s < _STANDSTILL * float(np.quantile(speed_m_per_s, 0.95))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_slow, [0]])))
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        if t_s[end - 1] - t_s[begin] < _SHORTEST_REST_S:
-            is_slow[begin:end] = False
+    for stretch in find_stretches(is_slow):
+        if t_s[stretch][-1] - t_s[stretch][0] < _SHORTEST_REST_S:
+            is_slow[stretch] = False
     return is_slow
 
 

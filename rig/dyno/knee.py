@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag  # pyright: ignore[reportUnknownVariableType]
 
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke
 from rig.dyno.strokes import Array
@@ -38,6 +39,8 @@ _MISFIT = 0.003
 """Share of the largest force by which a mean curve may bend between the samples of its strokes."""
 
 _KNEES = 240
+"""Knees that are tried, evenly spread by their logarithm: over two decades 2 % apart."""
+
 _LOWEST, _HIGHEST = 1.15, 0.9
 """Times the slowest and share of the fastest speed between which a knee is searched."""
 
@@ -53,51 +56,56 @@ class Knee(NamedTuple):
 def find_knee(strokes: Sequence[MeanStroke]) -> Knee | None:
     """The knee of one direction, from the mean strokes of its steps; None where there is none."""
     points = [_points(stroke) for stroke in strokes]
-    speeds = np.concatenate([item[0] for item in points])
-    fastest, slowest = float(speeds.max()), float(speeds.min())
-    floor_n = _MISFIT * max(float(np.abs(item[1]).max()) for item in points)
-    rows: list[tuple[Array, Array]] = []
-    for speed, force_n, covariance in points:
-        lower = np.linalg.cholesky(covariance + floor_n**2 * np.eye(len(speed)))
-        rows.append((np.asarray(np.linalg.inv(lower), np.float64), force_n))
-    whitened = np.concatenate([inverse @ force_n for inverse, force_n in rows])
-
-    def squares(knee: float | None) -> tuple[float, Array, Array]:
-        bases: list[Array] = []
-        for (inverse, _), (speed, *_) in zip(rows, points, strict=True):
-            base = [np.ones_like(speed), speed]
-            base += [] if knee is None else [np.maximum(speed - knee, 0.0)]
-            bases.append(inverse @ np.column_stack(base))
-        design = np.concatenate(bases)
-        weights = np.asarray(np.linalg.lstsq(design, whitened, rcond=None)[0], np.float64)
-        residual = whitened - design @ weights
-        return float(residual @ residual), weights, design
-
-    tried = np.geomspace(_LOWEST * slowest, _HIGHEST * fastest, _KNEES)
-    freedom = len(whitened) - 4
+    speed, force_n = (np.concatenate([item[i] for item in points]) for i in (0, 1))
+    whitening = _whitening([covariance for *_, covariance in points], force_n)
+    target = whitening @ force_n
+    lines = whitening @ np.column_stack([np.ones_like(speed), speed])
+    tried = np.geomspace(_LOWEST * float(speed.min()), _HIGHEST * float(speed.max()), _KNEES)
+    freedom = len(target) - 4
     if freedom < 1 or tried[-1] <= tried[0]:
         return None
-    sums = np.array([squares(float(knee))[0] for knee in tried])
+    bends = whitening @ np.maximum(speed[:, None] - tried, 0.0)
+    fits = [_fit(np.column_stack([lines, bend]), target) for bend in bends.T]
+    sums = np.array([squares for _, squares in fits])
     best = int(np.argmin(sums))
-    scale = max(1.0, float(sums[best]) / freedom)
-    _, weights, design = squares(float(tried[best]))
-    below, above = float(weights[1]), float(weights[1] + weights[2])
-    steep, flat = max(abs(below), abs(above)), min(abs(below), abs(above))
-    gain = (squares(None)[0] - float(sums[best])) / scale
-    if gain < _CHANCE or steep < _STRAIGHT * flat:
+    weights, least = fits[best]
+    scale = max(1.0, least / freedom)
+    below, above = abs(float(weights[1])), abs(float(weights[1] + weights[2]))
+    straight = _fit(lines, target)[1]
+    if straight - least < _CHANCE * scale or max(below, above) < _STRAIGHT * min(below, above):
         return None
-    inside = tried[sums <= sums[best] + _QUANTILE * scale]
+    inside = tried[sums <= least + _QUANTILE * scale]
     step = float(tried[1] / tried[0])
     method = f"two straight lines through force over speed, {len(strokes)} steps"
     knee = Figure(
         float(tried[best]), float(inside.min()) / step, float(inside.max()) * step, method
     )
-    covariance = np.asarray(scale * np.linalg.pinv(design.T @ design), np.float64)
+    # A knee elsewhere changes the slopes, too.
+    moved = whitening @ (-weights[2] * (speed > tried[best]))
+    jacobian = np.column_stack([lines, bends[:, best], moved])
+    covariance = np.asarray(scale * np.linalg.pinv(jacobian.T @ jacobian), np.float64)[:3, :3]
     slopes = [
         _slope(row, weights, covariance, sign=strokes[0].sign)
         for row in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0]))
     ]
     return Knee(knee, *slopes)
+
+
+def _whitening(covariances: Sequence[Array], force_n: Array) -> Array:
+    """Matrix by which the errors of all forces (N,) become independent, of variance one."""
+    misfit_n = _MISFIT * float(np.abs(force_n).max())
+    factors = [
+        np.linalg.cholesky(covariance + misfit_n**2 * np.eye(len(covariance)))
+        for covariance in covariances
+    ]
+    return np.asarray(np.linalg.inv(block_diag(*factors)), np.float64)
+
+
+def _fit(design: Array, target: Array) -> tuple[Array, float]:
+    """Weights of least squares, and the sum of squares that they leave."""
+    weights = np.asarray(np.linalg.lstsq(design, target, rcond=None)[0], np.float64)
+    residual = target - design @ weights
+    return weights, float(residual @ residual)
 
 
 def _slope(row: Array, weights: Array, covariance: Array, *, sign: int) -> Figure:

@@ -22,6 +22,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize_scalar  # pyright: ignore[reportUnknownVariableType]
 
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.recordings.stretches import find_stretches
 
 Array = NDArray[np.float64]
 
@@ -217,26 +218,25 @@ def _split_by_shape(t_s: Array, height_m: Array, run: list[Stroke]) -> Iterator[
         return
     apart = np.zeros(len(run))
     for side in (slice(0, None, 2), slice(1, None, 2)):
-        shapes = np.array([_shape(t_s, height_m, stroke) for stroke in run[side]])
+        # As shares of the rise.
+        shapes = np.array(
+            [
+                (_heights_along(t_s, height_m, stroke) - height_m[stroke.first]) / stroke.rise_m
+                for stroke in run[side]
+            ]
+        )
         apart[side] = np.std(shapes - np.median(shapes, axis=0), axis=1)
     usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
     largest = max(_ODD_SHAPE, _ODD_NOISE * _noise_m(height_m) / usual_m)
-    part: list[Stroke] = []
-    for stroke, is_odd in zip([*run, run[-1]], [*(apart > largest), True], strict=True):
-        if not is_odd:
-            part.append(stroke)
-            continue
-        if len(part) >= _FEWEST_STROKES:
-            yield part
-        part = []
+    parts = (run[alike] for alike in find_stretches(apart <= largest))
+    yield from (part for part in parts if len(part) >= _FEWEST_STROKES)
 
 
-def _shape(t_s: Array, height_m: Array, stroke: Stroke) -> Array:
-    """Heights over the duration of a stroke, as shares of its rise, shape (41,)."""
+def _heights_along(t_s: Array, height_m: Array, stroke: Stroke) -> Array:
+    """Heights at even shares of the duration of a stroke, shape (41,)."""
     share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
     at_s = t_s[stroke.first] + share * stroke.duration_s
-    heights = np.asarray(np.interp(at_s, t_s, height_m), np.float64)
-    return (heights - height_m[stroke.first]) / stroke.rise_m
+    return np.asarray(np.interp(at_s, t_s, height_m), np.float64)
 
 
 def _single_cycle(t_s: Array, height_m: Array, stroke: Stroke) -> Block | None:
@@ -276,15 +276,8 @@ def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
     """
     if len(block.strokes) < _FEWEST_UNLIKE_A_SERIES:
         return False
-    share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
     for side in (block.strokes[::2], block.strokes[1::2]):
-        shapes: Array = np.array(
-            [
-                np.interp(t_s[stroke.first] + share * stroke.duration_s, t_s, height_m)
-                for stroke in side
-            ],
-            dtype=np.float64,
-        )
+        shapes = np.array([_heights_along(t_s, height_m, stroke) for stroke in side])
         apart = shapes - shapes.mean(axis=1, keepdims=True)
         usual_m = float(np.median([abs(stroke.rise_m) for stroke in side]))
         if float(np.std(apart - apart.mean(axis=0))) > _SAME_SHAPE * usual_m:

@@ -34,7 +34,8 @@ from rig.log.reader import RunFolder, read_run
 from rig.plan.build import build_plant
 from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
-from rig.tuning.expectation import FEWEST, free_error, stretches
+from rig.recordings.stretches import find_stretches
+from rig.tuning.expectation import FEWEST, free_error
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -95,7 +96,9 @@ def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, t
     running = run.steps.column("mode").to_numpy() == Mode.RUNNING
     missed_s = _MISSED * plan.period_ns * 1e-9
     unbroken = [
-        part for stretch in stretches(running) for part in _split_at_gaps(tick_s, stretch, missed_s)
+        part
+        for stretch in find_stretches(running)
+        for part in _split_at_gaps(tick_s, stretch, missed_s)
     ]
     pieces = [piece for stretch in unbroken for piece in _split_long(tick_s, stretch)]
     for number, (piece, inner) in enumerate(pieces):

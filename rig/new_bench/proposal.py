@@ -385,12 +385,11 @@ def _hints_at_checks(choice: Choice, found: Mapping[str, str]) -> list[str]:
     if "valid" not in found and bits:
         hints.append(
             f"  # if a bit marks it as valid, add: valid: {{signal: {bits[0]}, value: 1}}"
-            + (f"; or {', '.join(bits[1:])}" if bits[1:] else "")
+            + _or_others(bits)
         )
     if "counter" not in found and counters and choice.message.protection is None:
         hints.append(
-            f"  # if a signal counts its frames, add: counter: {counters[0]}"
-            + (f"; or {', '.join(counters[1:])}" if counters[1:] else "")
+            f"  # if a signal counts its frames, add: counter: {counters[0]}" + _or_others(counters)
         )
     return hints
 
@@ -532,9 +531,13 @@ def _hint_at_bits(message: Message) -> list[str]:
     bits = [item.name for item in message.signals.values() if item.length_bits == 1]
     if not bits:
         return []
-    return [f"  # if this is its bit: valid: {{message: {message.name}, signal: {bits[0]}}}"] + (
-        [f"  # or {', '.join(bits[1:])}"] if bits[1:] else []
-    )
+    entry = f"valid: {{message: {message.name}, signal: {bits[0]}}}"
+    return [f"  # if this is its bit: {entry}{_or_others(bits)}"]
+
+
+def _or_others(names: Sequence[str]) -> str:
+    """All names but the first, as what it could be instead; empty without any."""
+    return f"; or {', '.join(names[1:])}" if names[1:] else ""
 
 
 def _hint_at_messages(forces: Sequence[str]) -> list[str]:

@@ -20,6 +20,7 @@ from rig.dyno.tolerance import PointVerdict
 from rig.files.pictures import new_figure
 from rig.pages.html import svg_url
 from rig.pages.plotted_quantities import us_units
+from rig.pages.report.series import envelope
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 RECORD_COLOURS = ("#111111", "#0072b2", "#d55e00", "#a3458f", "#007a58", "#7f6000")
@@ -120,11 +121,8 @@ def draw_account(item: Characteristics) -> dict[str, str]:
 def _draw_channel(axes: Any, item: Characteristics, values: Array) -> None:
     """A channel over time, thinned by minimum and maximum, over the uses of the record."""
     t_s = item.record.t_s
-    size = max(1, len(t_s) // _PARTS)
-    count = len(t_s) // size * size
-    parts = values[:count].reshape(-1, size)
-    both = np.column_stack([parts.min(axis=1), parts.max(axis=1)]).ravel()
-    axes.plot(np.repeat(t_s[:count:size], 2), both, color=RECORD_COLOURS[0], linewidth=0.6)
+    kept = envelope(values, 2 * _PARTS)
+    axes.plot(t_s[kept], values[kept], color=RECORD_COLOURS[0], linewidth=0.6)
     for span in item.account:
         colour = _USES[span.use]
         if colour:

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.recordings.stretches import find_stretches
+
 Array = NDArray[np.float64]
 
 _LONGEST_PLATEAU = 0.002
@@ -37,8 +39,10 @@ class Plateaus(NamedTuple):
 def _find_plateaus(values: Array) -> list[Plateaus]:
     plateaus: list[Plateaus] = []
     for extreme, limit in (("lowest", float(values.min())), ("highest", float(values.max()))):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], values == limit, [0]])))
-        plateaus.append(Plateaus(extreme, limit, edges[::2], edges[1::2] - edges[::2]))
+        found = find_stretches(values == limit)
+        firsts = np.array([stretch.start for stretch in found], np.int64)
+        lengths = np.array([stretch.stop - stretch.start for stretch in found], np.int64)
+        plateaus.append(Plateaus(extreme, limit, firsts, lengths))
     return plateaus
 
 

@@ -19,6 +19,7 @@ from rig.bridge.values import Mode
 from rig.closed_loop.poles import OperatingPoint
 from rig.closed_loop.strut_response import USUAL_SPEED_M_PER_S
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.recordings.stretches import find_stretches
 
 Array = NDArray[np.float64]
 
@@ -99,7 +100,7 @@ def longest_stretch(
     def column(name: str) -> Array:
         return np.asarray(steps.column(name).to_numpy(), dtype=np.float64)
 
-    running = stretches(column("mode") == Mode.RUNNING)
+    running = find_stretches(column("mode") == Mode.RUNNING)
     stretch = max(running, key=lambda item: item.stop - item.start, default=slice(0, 0))
     tick_s = column("t_ns")[stretch] * 1e-9
     stretch = slice(stretch.start, stretch.start + int(np.sum(tick_s <= tick_s[:1] + _LONGEST_S)))
@@ -197,12 +198,6 @@ def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) ->
     power_n2 = np.full(20, rms_n**2 / 20.0)
     source = f"{rms_n:g} N up to {up_to_hz:g} Hz, as stated"
     return Expectation(noise_std_m, frequency_hz, power_n2, source)
-
-
-def stretches(holds: NDArray[np.bool_]) -> list[slice]:
-    """The stretches in which a condition holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))).tolist()
-    return [slice(*pair) for pair in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _integrate_twice(tick_s: Array, acceleration: Array, t_s: Array) -> Array:

@@ -12,12 +12,14 @@ from dart_model.effects import effect
 from rig.diagnosis.damper_forces import Damper, list_velocities, with_half_widths
 from rig.diagnosis.search.fit import FitCovariance
 
-CONSTANTS = (0.5, 900.0, 100.0, 9.81)
+
+def constants_with(damping_n_s_per_m):
+    return 0.5, 900.0, damping_n_s_per_m, 9.81
 
 
 @given(damping=st.floats(1.0, 1e4), speed=st.floats(1e-3, 3.0), sign=st.sampled_from([-1.0, 1.0]))
 def test_a_linear_damper_is_its_damping(damping, speed, sign):
-    force_n, slope = Damper(damping, (), CONSTANTS, 0.4).figures(np.array([sign * speed]))
+    force_n, slope = Damper((), constants_with(damping), 0.4).figures(np.array([sign * speed]))
     assert force_n[0] == pytest.approx(-damping * sign * speed, rel=1e-12)
     assert slope[0] == pytest.approx(damping, rel=1e-9)
 
@@ -26,7 +28,7 @@ def test_below_and_beyond_a_sharp_knee_are_the_two_slopes():
     law = effect("blow_off_damping")
     values = {"lost_damping_n_s_per_m": 590.0, "knee_velocity_m_per_s": 0.14}
     parameters = [values[parameter.name] for parameter in law.parameters]
-    damper = Damper(650.0, ((law, parameters),), CONSTANTS, 0.4)
+    damper = Damper(((law, parameters),), constants_with(650.0), 0.4)
     force_n, slope = damper.figures(np.array([-0.3, -0.05, 0.05, 0.3]))
     assert slope == pytest.approx([60.0, 650.0, 650.0, 60.0], rel=1e-9)
     beyond_n = 650.0 * 0.14 + 60.0 * 0.16

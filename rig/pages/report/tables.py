@@ -131,19 +131,16 @@ def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
 
 def damper(diagnosis: Diagnosis) -> tuple[Row, ...]:
     """Strut, velocity, force and its interval, damping and its interval, for each velocity."""
+    unit = LINEAR["damping_n_s_per_m"][1]
     rows: list[Row] = []
     for item in diagnosis.damper:
         direction = "rebound" if item.velocity_m_per_s > 0.0 else "compression"
         # A round speed, which has no digits to spare.
         speed = f"{direction} {with_unit(f'{abs(item.velocity_m_per_s):g}', 'm/s')}"
         force = value_and_interval(item.force_n, "N")
-        rows.append(
-            (item.strut, speed, *force, *value_and_interval(item.damping_n_s_per_m, _SLOPE))
-        )
+        slope = value_and_interval(item.damping_n_s_per_m, unit)
+        rows.append((item.strut, speed, *force, *slope))
     return tuple(rows)
-
-
-_SLOPE = LINEAR["damping_n_s_per_m"][1]
 
 
 def existing(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
