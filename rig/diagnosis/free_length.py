@@ -50,9 +50,10 @@ def notes_of_springs(
         gradient = _gradient(problem.linear, fit, index, slopes)
         zero = _Length(zero_m, covariance.factor * _std(covariance, gradient))
         notes.append(
-            f"The stiffness of strut {before.name} is corrected about {middle_m:.4g} m. The "
-            f"corrected model states this as the new stiffness and {preload_n:+.3g} N of preload, "
-            f"which together are a linear spring of the free length {zero}."
+            f"Stiffness and preload of strut {before.name} are corrected about {middle_m:.4g} m. "
+            f"The corrected model states the preload about its free_length_m of "
+            f"{after.free_length_m:.4g} m, where the same line is {preload_n:+.3g} N: a linear "
+            f"spring of the free length {zero}."
         )
         if change.get("free_length"):
             both = np.stack([gradient, _gradient(problem.linear, fit, index, {"free_length": 1.0})])

@@ -97,10 +97,10 @@ def ratio(value: float, reference: float) -> str:
 
 
 def times(factor: float) -> str:
-    """A factor with two digits."""
+    """A factor with two digits, near 1 with three: 1.206 is above a limit of 1.2, and seen to be."""
     if factor >= 100.0:
         return number(factor, 1 - math.floor(math.log10(factor)))
-    if factor < 1.0:
+    if factor < 2.0:
         return f"{factor:.2f}"
     return f"{factor:.1f}" if factor < 10.0 else f"{factor:.0f}"
 
