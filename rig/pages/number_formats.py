@@ -97,7 +97,7 @@ def ratio(value: float, reference: float) -> str:
 
 
 def times(factor: float) -> str:
-    """A factor with two digits, near 1 with three: 1.206 is above a limit of 1.2, and seen to be."""
+    """A factor with two digits, near 1 with three: 1.206 is above a limit of 1.2."""
     if factor >= 100.0:
         return number(factor, 1 - math.floor(math.log10(factor)))
     if factor < 2.0:
