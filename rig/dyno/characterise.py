@@ -9,14 +9,13 @@ from can_dbc.errors import InputError, expected_name
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
+from rig.dyno.sensor_faults import find_level_limits, judge_sensors
+from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
 from rig.dyno.timeline import Span, account
 from rig.log.reader import read_run
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
-
-_LARGEST_N = 1e8
-"""Ten times what the largest damper machines of civil engineering reach."""
 
 _FEWEST_SAMPLES_A_CYCLE = 10
 
@@ -89,20 +88,24 @@ def characterise_record(record: ForceRecord) -> Characteristics:
     """Figures of a damper from its record, without missing values.
 
     Raises:
-        InputError: No cycle of the record repeats.
+        InputError: No cycle of the record repeats, or its values are not those of a damper.
     """
-    name, t_s, height_m, force_n = record[:4]
-    largest_n = float(np.abs(force_n).max(initial=0.0))
-    if largest_n > _LARGEST_N:
-        raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
+    record, faults = judge_sensors(record)
+    t_s, height_m = record.t_s, record.height_m
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(t_s, height_m, strokes)
-    computed = [(block, compute_step(record, block)) for block in blocks]
+    computed = [(block, compute_step(record, block, faults.limits)) for block in blocks]
+    levels = find_level_limits(
+        [stroke for _, step in computed if not isinstance(step, str) for stroke in step.strokes]
+    )
+    if levels != ForceRange():
+        faults = faults._replace(limits=faults.limits.within(levels))
+        computed = [(block, compute_step(record, block, faults.limits)) for block in blocks]
     kept = [(block, step) for block, step in computed if not isinstance(step, str)]
     if not kept:
         raise InputError(
-            f"{name}: no steady cycle in {len(strokes)} strokes: never three in a row of equal "
-            f"amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
+            f"{record.name}: no steady cycle in {len(strokes)} strokes: never three in a row of "
+            f"equal amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
             "repeats its cycles"
         )
     rests = find_holds(t_s, height_m, blocks)
@@ -115,7 +118,7 @@ def characterise_record(record: ForceRecord) -> Characteristics:
         for stroke in block.strokes
     }
     spans = account(t_s, strokes, [block for block, _ in kept], rejected, rests)
-    warnings = quality(record, marked, holds, spans)
+    warnings = quality(record, marked, holds, spans, faults)
     return Characteristics(record, marked, holds, summarise_damper(marked), warnings, spans)
 
 

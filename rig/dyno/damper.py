@@ -7,7 +7,7 @@ import numpy as np
 
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.knee import find_knee
-from rig.dyno.stroke_force import Figure, student_factor
+from rig.dyno.stroke_force import ANGLES, Figure, student_factor
 
 _ALIKE_SPEED = 0.05
 """Relative difference of speed and amplitude up to which steps are repetitions of each other."""
@@ -17,6 +17,11 @@ _LEAST_WARMING_K = 2.0
 
 _WARM_UP = 2.0
 """Ratio of the first step's cycles to those of the others, from which it is a warm-up."""
+
+_SPRING_DEGREE, _INNER = 3, 0.95
+"""Of the polynomial in the height that is the spring, and share of the stroke that it is fitted to:
+at the turning points friction reverses. Of a gas column of three times the stroke it leaves 0.3 %.
+"""
 
 _FEWEST_STROKES = 6
 """Fewest strokes for a change per kelvin."""
@@ -67,6 +72,8 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         speed = 1e3 * slowest.peak_speed_m_per_s
         gas_force, gas_rate, friction = (
             figure._replace(method=f"{figure.method}, at {speed:.2g} mm/s")
+            if figure.is_bounded
+            else None
             for figure in (
                 slowest.mean_force_n,
                 slowest.spring_rate_n_per_m,
@@ -84,9 +91,17 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         )
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
     usual = [step for step in steps if step.kind != "warm_up"] or steps
-    knee = {
-        name: find_knee([step.strokes[index] for step in usual]) for index, name in enumerate(SIDES)
-    }
+    spring = (
+        spring_curve(min(slow, key=lambda it: it.peak_speed_m_per_s)) if slow else np.zeros_like
+    )
+    strokes = {name: [step.strokes[index] for step in usual] for index, name in enumerate(SIDES)}
+    knee = {name: find_knee(mine, spring) for name, mine in strokes.items()}
+    clipped = [name for name, mine in strokes.items() if any(it.is_clipped for it in mine)]
+    if clipped:
+        notes.append(
+            f"the force was clipped in {' and '.join(clipped)}: knee and slopes are of what was "
+            "not, and figures that depend on the rest are bounds or missing"
+        )
     if not any(knee.values()):
         is_single = len(usual) == 1 and any(stroke.is_constant for stroke in usual[0].strokes)
         why = "the test has a single speed" if is_single else "force over speed has no bend in it"
@@ -106,6 +121,18 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     )
 
 
+def spring_curve(step: DynoStep) -> np.polynomial.Polynomial:
+    """Force of gas and spring over height: the mean of both strokes of a slow step.
+
+    Friction and damping of like size in both directions cancel in it.
+    """
+    down, up = step.strokes
+    inner = np.abs(np.sin(ANGLES)) <= _INNER
+    # At one height one stroke is at an angle, and the other at its negative.
+    mean_n = 0.5 * (down.force_n + up.force_n[::-1])
+    return np.polynomial.Polynomial.fit(down.height_m[inner], mean_n[inner], _SPRING_DEGREE)
+
+
 def mark_warm_up(steps: Sequence[DynoStep]) -> tuple[DynoStep, ...]:
     """The steps, in time, of which the first one is a warm-up if it is longer than the others."""
     first, *others = steps
@@ -119,6 +146,8 @@ def mark_warm_up(steps: Sequence[DynoStep]) -> tuple[DynoStep, ...]:
 def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     """Ratio of the forces, by the delta method."""
     up, down = step.rebound.force_at_peak_velocity_n, step.compression.force_at_peak_velocity_n
+    if not (up.is_bounded and down.is_bounded):
+        return None
     offset = 0.0 if gas is None else gas.value
     rebound, compression = -(up.value - offset), down.value - offset
     if compression <= 0.0 or rebound <= 0.0:

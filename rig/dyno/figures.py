@@ -26,7 +26,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
+from rig.dyno.stroke_force import (
+    ANGLES,
+    Figure,
+    ForceRange,
+    MeanStroke,
+    combine,
+    mean_stroke,
+)
 from rig.dyno.strokes import Array, Block, BlockMotion, fit_motion, is_repetition
 
 _QUASI_STATIC_M_PER_S = 5e-3
@@ -71,6 +78,17 @@ class ForceRecord(NamedTuple):
     temperature_c: Array | None = None
     strut: str = ""
     source: str = "load cell"
+
+    def without(self, samples: NDArray[np.bool_]) -> "ForceRecord":
+        """The record without some samples, shape (N,)."""
+        kept = ~samples
+        warm_c = None if self.temperature_c is None else self.temperature_c[kept]
+        return self._replace(
+            t_s=self.t_s[kept],
+            height_m=self.height_m[kept],
+            force_n=self.force_n[kept],
+            temperature_c=warm_c,
+        )
 
 
 class Side(NamedTuple):
@@ -148,8 +166,8 @@ class DynoStep(NamedTuple):
         )
 
 
-def compute_step(record: ForceRecord, block: Block) -> DynoStep | str:
-    """Figures of a block, or why it has none."""
+def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoStep | str:
+    """Figures of a block, or why it has none; of a load cell that is clipped at the limits."""
     t_s, height_m, here = record.t_s, record.height_m, slice(block.begin, block.end)
     force_n = record.force_n[here]
     warm_c = None if record.temperature_c is None else record.temperature_c[here]
@@ -163,6 +181,7 @@ def compute_step(record: ForceRecord, block: Block) -> DynoStep | str:
     if down is None or up is None:
         samples = (block.end - block.begin) / block.cycles
         return f"{len(block.strokes)} strokes with {samples:.0f} samples a cycle, which are too few"
+    down, up = down.clipped_at(limits), up.clipped_at(limits)
     speed_std = motion.velocity_std_m_per_s
     sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
     speed = max(side.peak_velocity_m_per_s.value for side in sides)
@@ -210,7 +229,8 @@ def _warmth(
     """Temperature of each stroke, and its force about mid-stroke as the mean stroke's and more."""
     position = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
     central = (np.abs(position) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
-    if warm_c is None or not central.any():
+    is_clipped = np.any(stroke.beyond[np.abs(np.sin(ANGLES)) < _CENTRAL])
+    if warm_c is None or is_clipped or not central.any():
         return np.empty(0), np.empty(0)
     more_n = force_n[central] - stroke.row(np.arcsin(position[central])) @ stroke.force_n
     about = np.arcsin(np.linspace(-_CENTRAL, _CENTRAL, 41))

@@ -2,14 +2,15 @@
 
 Force over speed is described by two straight lines that meet at the knee, where the valves open.
 Each step gives the force at the speeds that its strokes pass through, as the mean of speeding up
-and slowing down, in which a spring and a small lag cancel. Slow steps determine the line below the
+and slowing down, in which a straight spring and a small lag cancel; the bend of a gas spring is
+removed, as the slowest step shows it. Slow steps determine the line below the
 knee, fast ones the line above; the covariances of the mean strokes are their weights.
 
 Reference: Seber and Wild, Nonlinear Regression (1989), 9, for segmented regression and the interval
 of a joint from the sum of squares.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -53,10 +54,15 @@ class Knee(NamedTuple):
     above_n_s_per_m: Figure
 
 
-def find_knee(strokes: Sequence[MeanStroke]) -> Knee | None:
-    """The knee of one direction, from the mean strokes of its steps; None where there is none."""
-    points = [_points(stroke) for stroke in strokes]
+def find_knee(strokes: Sequence[MeanStroke], spring: Callable[[Array], Array]) -> Knee | None:
+    """The knee of one direction, from the mean strokes of its steps; None where there is none.
+
+    `spring` gives the spring force at heights, which is removed from each stroke.
+    """
+    points = [_points(stroke, spring) for stroke in strokes]
     speed, force_n = (np.concatenate([item[i] for item in points]) for i in (0, 1))
+    if not len(speed):
+        return None
     whitening = _whitening([covariance for *_, covariance in points], force_n)
     target = whitening @ force_n
     lines = whitening @ np.column_stack([np.ones_like(speed), speed])
@@ -114,8 +120,11 @@ def _slope(row: Array, weights: Array, covariance: Array, *, sign: int) -> Figur
     return Figure(value, value - half, value + half, "line on its side of the knee")
 
 
-def _points(stroke: MeanStroke) -> tuple[Array, Array, Array]:
-    """Speeds of a stroke, forces there, and their covariance."""
+def _points(stroke: MeanStroke, spring: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+    """Speeds of a stroke, forces there without the spring, and their covariance.
+
+    Speeds at which the force was clipped are left out.
+    """
     speed = np.abs(stroke.velocity_m_per_s)
     top = int(np.argmax(speed))
     if stroke.is_constant or not 0 < top < len(speed) - 1:
@@ -130,7 +139,10 @@ def _points(stroke: MeanStroke) -> tuple[Array, Array, Array]:
                 for v in at.tolist()
             ]
         )
-    return at, rows @ stroke.force_n, rows @ stroke.covariance @ rows.T
+    rows = np.atleast_2d(rows)
+    whole = ~np.any(rows[:, stroke.beyond != 0] != 0.0, axis=1)
+    at, rows = at[whole], rows[whole]
+    return at, rows @ (stroke.force_n - spring(stroke.height_m)), rows @ stroke.covariance @ rows.T
 
 
 def _row_at(speed: Array, value: float, offset: int) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
 from rig.dyno.figures import DynoStep
-from rig.dyno.stroke_force import ANGLES, MeanStroke
+from rig.dyno.stroke_force import MeanStroke
 from rig.dyno.strokes import Array
 
 _NODES = 120
@@ -148,8 +148,7 @@ def refuse_unsuitable(record: Characteristics) -> None:
 
 def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     """Damping over speed: a stroke without gas and friction, mean of both its halves."""
-    height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
-    damping_n = -stroke.sign * (stroke.force_n - bare.gas(height)) - bare.friction_n
+    damping_n = -stroke.sign * (stroke.force_n - bare.gas(stroke.height_m)) - bare.friction_n
     speed = np.abs(stroke.velocity_m_per_s)
     top = int(np.argmax(speed))
     peak = float(speed[top])

@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from rig.dyno.figures import SIDES, AtRest, DynoStep, ForceRecord
+from rig.dyno.sensor_faults import SensorFaults
 from rig.dyno.stroke_force import FINE, MeanStroke
 from rig.dyno.strokes import Array
 from rig.dyno.timeline import Span, words
@@ -36,17 +37,22 @@ _CERTAIN = 5.0
 
 
 def quality(
-    record: ForceRecord, steps: Sequence[DynoStep], holds: Sequence[AtRest], spans: Sequence[Span]
+    record: ForceRecord,
+    steps: Sequence[DynoStep],
+    holds: Sequence[AtRest],
+    spans: Sequence[Span],
+    faults: SensorFaults,
 ) -> tuple[str, ...]:
     """Warnings of gaps, few samples, coarse steps, a wrong sign, drift, poor fits, what is unused.
 
-    `spans` account for the whole record.
+    `spans` account for the whole record, `faults` are those of its sensors.
     """
     t_s, force_n = record.t_s, record.force_n
     return (
         *_sign(steps),
+        *faults.words(),
         *(words(span) for span in spans if span.use == "rejected"),
-        *preflight(t_s, {"force": force_n}),
+        *preflight(t_s, {"height": record.height_m}),
         *_few_samples(t_s, steps),
         *_coarse(force_n),
         *_drift(holds),
@@ -118,18 +124,20 @@ def _coarse(force_n: Array) -> Iterator[str]:
 
 
 def _drift(holds: Sequence[AtRest]) -> Iterator[str]:
-    """The first two rests at one height whose forces differ by more than both their intervals."""
-    for earlier, later in combinations(holds, 2):
-        before, after = earlier.force_n, later.force_n
-        is_same_height = abs(later.height_m - earlier.height_m) <= _SAME_HEIGHT_M
-        if is_same_height and (after.low > before.high or after.high < before.low):
-            yield (
-                f"the force at rest at {1e3 * earlier.height_m:.1f} mm changed by "
-                f"{after.value - before.value:+.3g} N from {earlier.begin_s:.1f} s to "
-                f"{later.begin_s:.1f} s: gas that warms, friction that holds another way, or a "
-                "cell that drifts"
-            )
-            return
+    """The two rests at one height whose forces differ most, if by more than their intervals."""
+    changes = [
+        (later.force_n.value - earlier.force_n.value, earlier, later)
+        for earlier, later in combinations(holds, 2)
+        if abs(later.height_m - earlier.height_m) <= _SAME_HEIGHT_M
+        and (later.force_n.low > earlier.force_n.high or later.force_n.high < earlier.force_n.low)
+    ]
+    if changes:
+        change_n, earlier, later = max(changes, key=lambda item: abs(item[0]))
+        yield (
+            f"the force at rest at {1e3 * earlier.height_m:.1f} mm changed by {change_n:+.3g} N "
+            f"from {earlier.begin_s:.1f} s to {later.begin_s:.1f} s: gas that warms, friction that "
+            "holds another way, or a cell that drifts"
+        )
 
 
 def _left_samples(steps: Sequence[DynoStep]) -> Iterator[str]:

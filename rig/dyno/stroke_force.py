@@ -14,6 +14,7 @@ References:
     Dixon, The Shock Absorber Handbook (2007), 10, for the tests.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -59,17 +60,41 @@ _FEWEST_CLUSTERS = 4
 
 
 class Figure(NamedTuple):
-    """A figure with its 95 % interval, and the method that gave it."""
+    """A figure with its 95 % interval, and the method that gave it.
+
+    Where samples that it depends on were clipped, an end of the interval is infinite: the value is
+    a bound. If both are, the value means nothing.
+    """
 
     value: float
     low: float
     high: float
     method: str
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether both ends of its interval are known."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+class ForceRange(NamedTuple):
+    """Forces at which a load cell is clipped; infinite where it is not."""
+
+    low_n: float = -math.inf
+    high_n: float = math.inf
+
+    def within(self, other: "ForceRange") -> "ForceRange":
+        """The range that both leave."""
+        return ForceRange(max(self.low_n, other.low_n), min(self.high_n, other.high_n))
+
 
 _MIDDLE, _CONSTANT = 0.5, 0.1
 """Half of the stroke, and how much of the speed may differ in it where it is called constant: under
 a sine 13 per cent do."""
+
+_AT_LIMIT_SHARE, _AT_LIMIT_STDS, _BESIDE = 0.005, 4.0, 2
+"""Share of a limit and standard deviations within which a mean stroke is clipped, and how many
+angles next to it, where the spline rounds the corner."""
 
 _GRID = 181
 ANGLES: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _GRID)
@@ -95,6 +120,8 @@ class MeanStroke(NamedTuple):
         samples: How many samples lie nearest to each of `FINE`, shape (361,).
         sums_n: Sums of their forces, shape (361,).
         noise_n: Standard deviation of a sample about the mean stroke.
+        beyond: At `ANGLES` 1 where the true force lies above a clipped one, -1 where it lies below,
+            else 0, shape (181,).
     """
 
     sign: int
@@ -107,6 +134,29 @@ class MeanStroke(NamedTuple):
     samples: Array
     sums_n: Array
     noise_n: float
+    beyond: NDArray[np.int8]
+
+    @property
+    def height_m(self) -> Array:
+        """Height at `ANGLES`, shape (181,)."""
+        return self.middle_m + self.sign * self.amplitude_m * np.sin(ANGLES)
+
+    @property
+    def is_clipped(self) -> bool:
+        """Whether its force was clipped somewhere."""
+        return bool(np.any(self.beyond))
+
+    def clipped_at(self, limits: ForceRange) -> "MeanStroke":
+        """The same, marked where it is as good as at a limit, and next to that."""
+        marks = np.zeros(_GRID, np.int8)
+        for sign, limit in ((-1, limits.low_n), (1, limits.high_n)):
+            if math.isfinite(limit):
+                margin_n = _AT_LIMIT_SHARE * abs(limit) + _AT_LIMIT_STDS * np.sqrt(
+                    np.diag(self.covariance)
+                )
+                at = sign * (self.force_n - limit) >= -margin_n
+                marks[np.convolve(at, np.ones(2 * _BESIDE + 1), "same") > 0.0] = sign
+        return self._replace(beyond=marks)
 
     @property
     def is_constant(self) -> bool:
@@ -147,7 +197,11 @@ def combine(
     weighted = sum(v * v / stroke.freedom for v, (_, stroke) in zip(variances, parts, strict=True))
     freedom = variance * variance / weighted if weighted > 0.0 else 1e9
     half = _WIDER * student_factor(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
-    return Figure(value, value - half, value + half, method)
+    # Where a force was clipped, the true one moves the sum in one direction or in both.
+    moves = np.concatenate([np.sign(factor * row) * stroke.beyond for row, stroke in parts])
+    low = -math.inf if np.any(moves < 0.0) else value - half
+    high = math.inf if np.any(moves > 0.0) else value + half
+    return Figure(value, low, high, method)
 
 
 def student_factor(freedom: float) -> float:
@@ -208,6 +262,7 @@ def mean_stroke(
         samples,
         sums,
         float(np.sqrt(noise)),
+        np.zeros(_GRID, np.int8),
     )
 
 

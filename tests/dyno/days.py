@@ -1,8 +1,9 @@
-"""Test days of a damper on a sine machine, and their true forces.
+"""Test days of a damper on a sine machine, with what goes wrong on them, and their true forces.
 
 A day is a list of steps with rests between them. The machine begins a step from rest at mid-stroke
 with a quarter of a cycle, and ends it with one; it may build up and reduce the amplitude over a
-cycle. The dampers are those of `tests.dyno.population`.
+cycle. The dampers are those of `tests.dyno.population`; their damping may change with temperature.
+The load cell may lag, drift, be clipped before or behind its noise, and have spikes.
 """
 
 import math
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.dyno.population import MIDDLE_M, Damper, forces
+from tests.dyno.population import MIDDLE_M, Damper, forces, law
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Day:
-    """A day: its damper, steps, sampling rate and noises."""
+    """A day: its damper, steps, sampling rate, noises, and faults of the measurement."""
 
     damper: Damper
     steps: tuple[Step, ...]
@@ -42,6 +43,13 @@ class Day:
     noise_m: float = 5e-6
     ramp: bool = False
     first_rest_s: float = 1.0
+    lag_s: float = 0.0
+    drift_n: float = 0.0
+    clips_n: float = math.inf
+    clips_noise: bool = False
+    spikes: int = 0
+    warms_k: float = 0.0
+    per_kelvin: float = 0.0
 
     def starts_s(self):
         """Time at which each step begins."""
@@ -73,20 +81,48 @@ class Day:
             v[inside] = step.amplitude_m * (grown * step.omega * cosine + growth * sine)
         return x, v
 
+    def warm_k(self, t_s):
+        """Temperature above that of the start, towards an end."""
+        return self.warms_k * (1.0 - np.exp(-3.0 * t_s / self.length_s))
+
+    def force(self, x, v, warm_k):
+        """True forces of a motion at a temperature above that of the start."""
+        cold = forces(self.damper, x, v, 1.0 / self.rate_hz)
+        return cold + self.per_kelvin * warm_k * law(self.damper, v)
+
+    def times(self):
+        return np.arange(int(self.length_s * self.rate_hz)) / self.rate_hz
+
     def record(self, seed):
         """Times, measured heights and forces."""
         rng = np.random.default_rng(seed)
-        t_s = np.arange(int(self.length_s * self.rate_hz)) / self.rate_hz
-        x, v = self.motion(t_s)
-        force = forces(self.damper, x, v, 1.0 / self.rate_hz)
-        force = force + self.noise_n * rng.standard_normal(len(t_s))
+        t_s = self.times()
+        x, _ = self.motion(t_s)
+        late_s = t_s - self.lag_s
+        force = self.force(*self.motion(late_s), self.warm_k(late_s))
+        force = force + self.drift_n * t_s / self.length_s
+        noise = self.noise_n * rng.standard_normal(len(t_s))
+        if self.clips_noise:
+            force = np.clip(force + noise, -self.clips_n, self.clips_n)
+        else:
+            force = np.clip(force, -self.clips_n, self.clips_n) + noise
         height = MIDDLE_M + x + self.noise_m * rng.standard_normal(len(t_s))
+        force[rng.integers(0, len(t_s), self.spikes)] += 5000.0
         return t_s, height, force
 
+    def temperatures(self, seed):
+        """Measured temperatures."""
+        t_s = self.times()
+        return (
+            22.0 + self.warm_k(t_s) + 0.05 * np.random.default_rng(seed).standard_normal(len(t_s))
+        )
+
     def truth(self, index):
-        """True forces of a step at its peak speed, in compression and in rebound."""
-        v = self.steps[index].speed_m_per_s * np.array([-1.0, 1.0])
-        return forces(self.damper, np.zeros(2), v, 1.0 / self.rate_hz)
+        """True forces of a step at its peak speed, in compression and in rebound, at its mean
+        temperature."""
+        step, begin_s = self.steps[index], self.starts_s()[index]
+        warm_k = float(np.mean(self.warm_k(begin_s + np.linspace(0.0, step.length_s, 1001))))
+        return self.force(np.zeros(2), step.speed_m_per_s * np.array([-1.0, 1.0]), warm_k)
 
 
 def usual(**changes):
