@@ -263,9 +263,9 @@ class ModelTolerance(_Frozen):
         stiffness_n_per_m: Standard deviation of each strut's stiffness, in percent; 20 % if absent.
         damping_n_s_per_m: Standard deviation of each strut's damping, in percent; 40 % if absent.
         preload_n: Standard deviation of a constant force in each strut, in N, such as the stiffness
-            times the standard deviation of the free length; if absent, a tenth of the spring's
-            change of force over the recorded stroke plus the linear damper's force at the RMS
-            velocity.
+            times the standard deviation of the free length; if absent, a tenth of the sum of
+            the spring's change of force over the recorded stroke and the linear damper's force at
+            the RMS velocity.
         input_gain: Standard deviation of the gain of the applied force, in percent; 2 % if absent.
         free_length_m: Standard deviation of the length about which laws such as a cubic spring act,
             in m; if absent, a tenth of the recorded stroke.

@@ -75,7 +75,7 @@ def write_page(rows: list[tuple[float, float, float, float]]) -> None:
         (number, *(f"{value:.4g}" for value in row)) for number, row in enumerate(rows, start=1)
     ]
     spread = [
-        (name, *(f"{value:.3g}" for value in np.percentile(column, [50, 0, 100])))
+        (name, *(f"{value:.4g}" for value in np.percentile(column, [50, 0, 100])))
         for name, column in zip(FIGURES, np.array(rows).T, strict=True)
     ]
     write_evidence(

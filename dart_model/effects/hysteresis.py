@@ -199,7 +199,13 @@ DAHL = _hysteresis(
     parameters=(
         _LIMIT,
         _BEND,
-        Parameter("exponent", "", 0.3, 4.0, "sharpness of the transition to the largest force"),
+        Parameter(
+            "exponent",
+            "",
+            0.3,
+            4.0,
+            "the smaller it is, the sharper is the transition to the largest force",
+        ),
     ),
     force=_yielding,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",

@@ -219,7 +219,7 @@ POWER_DAMPING = _damper(
         Parameter("exponent", "", 0.3, 4.0, "exponent of the velocity"),
     ),
     force=_power,
-    reference="Symans and Constantinou, Eng. Struct. 20 (1998), fractional velocity damper",
+    reference="Symans et al., J. Struct. Eng. 134 (2008), non-linear viscous damper",
     starts=always((1.0, 0.5), (1.0, 1.5), (1.0, 2.5)),
     simpler=("linear_damping", "quadratic_damping"),
     shown=("force_at_1_m_per_s_n",),

@@ -124,7 +124,7 @@ class Supervision(BaseModel):
         overload_share: The estimate is invalid (HOLD) while more than this share of the last few
             hundred ticks was missed.
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: in addition,
-            an operator has to arm the bridge after each start and each safe state.
+            an operator has to arm the bridge after each start of a run and each safe state.
         fade_in_s: Time in which the published force fades in, from the safe output to the
             estimate, before the estimate is valid.
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe

@@ -35,7 +35,8 @@ def export_command(
     smoothed: Annotated[
         bool,
         typer.Option(
-            "--smoothed", help="With --format csv: add forces that are smoothed over the whole run."
+            "--smoothed",
+            help="With --format csv: add the force of each strut, smoothed over the whole run.",
         ),
     ] = False,
     fmu: Annotated[

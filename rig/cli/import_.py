@@ -81,8 +81,8 @@ def import_command(
     A table (text, XLSX, TDMS, MF4) requires --mapping, an MTS table either --mapping or
     --rebound. A bus log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export`
     wrote as MF4 or Parquet requires neither; a run that it wrote as CSV need not be imported. With
-    --fmu, SOURCE is a functional mock-up unit (FMU). An FMU contains a program: to import it
-    permits this program to run on this machine.
+    --fmu, SOURCE is a functional mock-up unit (FMU). An FMU contains a program:
+    importing the FMU permits this program to run on this machine.
     """
     if fmu:
         if config is not None or rebound is not None:

@@ -72,7 +72,7 @@ LengthAtRest = Annotated[
         min=1e-3,
         max=100.0,
         help="Length of the strut at rest, in m. Without --free-length-m, the free length follows "
-        "from it: under the weight alone (without an applied force), with --dyno without a force.",
+        "from it; the strut is then assumed to carry the weight alone (with --dyno: no load).",
     ),
 ]
 FreeLength = Annotated[
@@ -81,8 +81,8 @@ FreeLength = Annotated[
         metavar="M",
         min=1e-3,
         max=100.0,
-        help="Length of the strut without a force, as a drawing states it; by default from the "
-        "length at rest, mass and stiffness.",
+        help="Length of the strut without a force, as a drawing states it; by default, it follows "
+        "from --length-at-rest-m.",
     ),
 ]
 Stiffness = Annotated[

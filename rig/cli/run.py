@@ -29,7 +29,7 @@ def run(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of the run, or of the runs; by default runs/ with date and time.",
+            help="Folder of the run, or of the runs; by default runs/DATE_TIME.",
         ),
     ] = None,
     model: Annotated[

@@ -59,7 +59,8 @@ EdsFiles = Annotated[
     ),
 ]
 CycleMs = Annotated[
-    int | None, typer.Option(metavar="MS", min=1, max=65_535, help="Time between two measurements.")
+    int | None,
+    typer.Option(metavar="MS", min=1, max=65_535, help="Time between two frames of each TPDO."),
 ]
 HeartbeatMs = Annotated[
     int | None, typer.Option(metavar="MS", min=1, max=65_535, help="Time between two heartbeats.")

@@ -21,7 +21,8 @@ def set_command(
         list[str] | None,
         typer.Argument(
             metavar="KEY=VALUE",
-            help="New values for keys of the configuration under observers or supervision.",
+            help="New values for keys of the configuration under observers or supervision, except "
+            "kind and filter of an observer.",
         ),
     ] = None,
     acknowledge: Annotated[

@@ -69,9 +69,9 @@ GainMargin = Annotated[
         metavar="FACTOR",
         min=1.0,
         max=20.0,
-        help="Required gain margin: factor by which the response of the bench may be larger, or "
-        "smaller, than the model's while the loop stays stable; 1.1 for kalman and 2 for pi by "
-        "default.",
+        help="Required gain margin: factor by which the model may respond to the virtual force "
+        "more strongly, or less, than the observer assumes while the loop of the two stays stable; "
+        "1.1 for kalman and 2 for pi by default.",
     ),
 ]
 
@@ -108,7 +108,7 @@ def tune_command(
             metavar="RATIO",
             min=0.0,
             max=1.0,
-            help="Least permitted damping ratio of the poles of the loop.",
+            help="Least permitted damping ratio of the loop of model and observer.",
         ),
     ] = 0.1,
     gain_margin: GainMargin = None,
@@ -125,7 +125,7 @@ def tune_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Choose the observer gains with the smallest expected error of the force.
+    """Choose the observer gains with the smallest expected error of the estimated force.
 
     Requires --run, or --residual-n and --up-to-hz.
     """

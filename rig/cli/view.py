@@ -42,8 +42,8 @@ FoxgloveFlag = Annotated[
     bool,
     typer.Option(
         "--foxglove",
-        help="Publish the runs to Foxglove or Lichtblick instead of a page; requires the extra "
-        "`foxglove`.",
+        help="Publish the runs to Foxglove or Lichtblick instead of showing a page; requires the "
+        "extra `foxglove`.",
     ),
 ]
 

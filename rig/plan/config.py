@@ -176,8 +176,8 @@ class Signals(_Frozen):
     Attributes:
         height: Measured height of each strut, by strut name.
         further: Further sensors of a strut, by the names of strut and sensor.
-        QUANTITY: A quantity that the bench measures once, such as `applied_force`, by its key in
-            the table of measured quantities.
+        QUANTITY: A quantity for which the bench has one signal, such as `applied_force`, by its
+            key in the table of measured quantities.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -216,8 +216,8 @@ class PrescribedMotion(_Frozen):
 
     Attributes:
         settling_s: Time constant T of the filter that computes the velocity from the heights. The
-            relative error of the velocity is 3 (T omega)^2 at the angular frequency omega of the
-            motion.
+            relative error of the velocity is about 3 (T omega)^2 at the angular frequency omega of
+            the motion.
     """
 
     settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = 0.002

@@ -340,7 +340,7 @@ class Temperature(_Section):
         ambient_c: Temperature of the air in degrees Celsius.
         heat_capacity_j_per_k: Heat capacity of all dampers together in J/K; if absent, the
             dissipated power does not heat them.
-        cooling_time_s: Time constant of cooling in s; if absent, the damper does not cool.
+        cooling_time_s: Time constant of cooling in s; if absent, the air does not cool the dampers.
     """
 
     initial_c: float = 20.0
@@ -354,7 +354,8 @@ class UndeclaredEffect(_Section):
 
     Attributes:
         name: Name of the effect, as in the table of effects.
-        strut: Strut in which the effect acts, or whose upper body it changes.
+        strut: Strut in which the effect acts, or whose upper body it changes; `input_gain` and
+            `delay` change the applied force, whatever the strut is.
         parameters: Values of the effect's parameters, by name; those with a default may be absent.
     """
 
@@ -451,9 +452,10 @@ class Transmission(_Section):
         message: Message of the DBC.
         period_ns: Time between samples in ns; the cycle time in the DBC if absent.
         latency_ns: Time from sample to transmission in ns.
-        jitter_ns: Largest additional delay in ns; the delay is uniformly distributed from zero to
-            this value.
-        loss_probability: Probability that a frame is lost; the message's counter shows the loss.
+        jitter_ns: Largest additional delay in ns; the additional delay is uniformly distributed
+            from zero to this value.
+        loss_probability: Probability that a frame is lost; the message's counter, if it has one,
+            shows the loss.
         height: Height sensor whose reading is in the message, if any.
         applied_force: Sensor of the applied force whose reading is in the message, if any.
         strut_force: Load cell whose reading is in the message, if any.
@@ -492,7 +494,7 @@ class BenchConfig(_Section):
         gravity_m_per_s2: Gravitational acceleration.
         masses: Bodies.
         struts: Struts. Each carries one body; its lower end is the world or another body.
-        applied_force: The force that drives the bench, if any.
+        applied_force: The force that drives the bench, if any; positive upwards.
         prescribed_motion: The motion that drives a strut, if any (a dyno).
         temperature: Temperature, common to all dampers: the power that their damper curves
             dissipate heats them, and the air cools them.

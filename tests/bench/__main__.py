@@ -28,8 +28,8 @@ from tests.evidence import add_page_option, command_line, table, write_evidence
 TEXT = f"""
 The tables give the CPU time of one tick, as the median over {ROUNDS} rounds of {TICKS} ticks. The
 rounds of all rows of a table alternate. Each ratio is formed within one round; the tables give its
-median over the rounds, with the 10th and 90th percentile in parentheses. This median therefore
-differs from the ratio of the two medians.
+median over the rounds, with the 10th and 90th percentile in parentheses. This median may therefore
+differ from the ratio of the two medians.
 
 - *DART, scalar functions* and *DART, array functions*: bare DART loops with one moving body. They
   read position and velocity, set a force and call `World.step`. Reading and setting use DART's

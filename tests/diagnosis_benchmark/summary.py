@@ -42,15 +42,15 @@ RMS force of each planted effect is at least five times (in `outside` ten times)
 force that sensor noise alone causes below 25 Hz. The nominal model is exact (apart from these
 effects) or rough: its stiffness is wrong by up to 20 %, its damping by up to 40 %, its mass by up
 to 5 %, the measured applied force by up to 2 %, and a preload of up to 5 % of the weight (on a
-dyno, of the strut force) is missing.
+dyno, of the standard deviation of the strut force) is missing.
 
 `single`, `pair` and `triple` are groups with one, two and three planted effects; `complete` has
-none. In `foreign`, the planted force has a formula that `rig` does not contain; in `outside`, none
-of its laws describes the planted force. `rough` stands for a rough nominal model, `dyno` for a
-dyno; `rough` and `dyno` alone have one planted effect. On dynos, about half of the cases have a
-rough nominal model, unless the planted effect is linear. With a rough nominal model and no planted
-effect, `explained` is right, because linear corrections explain the data. The rows in italics
-combine several groups.
+none. In `foreign`, the planted force belongs to a family of `rig`, but has a formula that `rig`
+does not contain; in `outside`, no law of `rig` describes the planted force. `rough` stands for a
+rough nominal model, `dyno` for a dyno; `rough` and `dyno` alone have one planted effect. On dynos,
+about half of the cases have a rough nominal model, unless the planted effect is linear. With a
+rough nominal model and no planted effect, `explained` is right, because linear corrections explain
+the data. The rows in italics combine groups, as far as these were run.
 
 {{groups}} With `--one-of N` in the command at the end of the page,
 about one case of N was run in each group, and at least one.
@@ -65,8 +65,8 @@ A case counts as right if
 - or the verdict is `ambiguous`, and the planted families are named in this way or listed as rivals,
 - or nothing is planted, and the verdict is `nothing_missing`, or, with a rough nominal model, at
   most linear corrections are named and the verdict is not `not_explained`,
-- or no law describes the planted force, and the result claims neither that laws explain it nor that
-  nothing is missing.
+- or no law of `rig` describes the planted force, and the verdict is `partly_explained` or
+  `not_explained`.
 
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).

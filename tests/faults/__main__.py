@@ -33,15 +33,18 @@ time, and most events begin 2 s after the start. *The settled run* is the same r
 The test fails if a force with `VALID` = 1 has an error of more than three times the largest error
 of a valid force in the settled run.
 
-- *First invalid frame* and *valid again* are times since the event; these and the modes are those
-  of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent every 100 ms: a
-  mode that begins and ends between two of these frames is not listed.
-- *Then acknowledged*: the safe state is acknowledged 0.8 to 0.9 s after the event, and again every
-  second.
+- *First invalid frame* and *valid again* are times since the beginning of the event; these and the
+  modes are those of the noise-aware observer. The modes are those in `RIG_STATUS`, which is sent
+  every 100 ms: a mode that begins and ends between two of these frames is not listed. With the
+  wrong scale, SETTLING and HOLD alternate; each is listed once.
+- *Then acknowledged*: the safe state is acknowledged 0.8 to 0.9 s after the beginning of the event,
+  and again every second.
 - *Largest valid error* is relative to that of the settled run, for the PI observer with the
-  published gains / a damped PI observer / the noise-aware observer; a dash: no force was valid.
+  published gains / a damped PI observer / the noise-aware observer (their parameters are on the
+  page [What VALID promises](../explanation/validity.md#settling)); a dash: no force was valid.
 - In the last three rows, the bridge is a real process at 100 Hz that receives a signal of the
-  operating system, with a virtual bus in a separate network namespace; only `VALID` is decoded.
+  operating system, on a bus over UDP multicast in a separate network namespace; the errors of the
+  forces are not evaluated. Of several signals in one row, the longest time is stated.
 - The last column states what the bench itself has to do.
 """
 

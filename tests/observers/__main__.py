@@ -303,7 +303,7 @@ def reference_part(rows, seeds):
 def latency_part(rows):
     words = (
         "Reference case with exact heights that are 5 ms old, one seed: force error relative to "
-        "the peak force (`latency configured`: `delay_s: 0.005`):"
+        "the peak force (*latency configured*: with `delay_s: 0.005`):"
     )
     cells = [(name, _percent(value)) for name, value in rows.items()]
     return [words, table(("observer", "error"), cells)]
@@ -312,8 +312,9 @@ def latency_part(rows):
 def moving_part(rows):
     words = (
         "A bridge that joins a bench which has been moving for 2.53 s (noise of 20 µm, resolution "
-        "of 15 µm), noise-aware observer of 20 Hz: force error in N (RMS), from 0.2 s after the "
-        "first estimate on. Live runs are in real time:"
+        "of 15 µm), noise-aware observer with a bandwidth of 20 Hz: force error in N (RMS), from "
+        "0.2 s after the first estimate on. *From rest*: bench and bridge start together. Live "
+        "runs are in real time:"
     )
     cells = [
         (seed, *(f"{value:.2f}" for value in row.values())) for seed, row in enumerate(rows, 1)
@@ -331,15 +332,15 @@ def grid_part(rows):
     held = 100 * np.array([row["kalman_coverage"] for row in rows])
     low, high = np.percentile(held, [5, 95])
     words = (
-        f"{len(rows)} benches of the grid: {_span(MASSES_KG, 1)} kg, {_span(NATURAL_HZ, 1)} Hz, "
-        f"noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} heights per second. The errors "
-        "are divided by the errors with the published gains (scaled with the mass). A "
-        "ratio near zero means that the error with the published gains is far larger than the "
-        "force itself, as in an unstable loop:"
+        f"{len(rows)} benches of the grid: {_span(MASSES_KG, 1)} kg, natural frequencies of "
+        f"{_span(NATURAL_HZ, 1)} Hz, noise of {_span(NOISES_M, 1e6)} µm, {_span(RATES_HZ, 1)} "
+        "heights per second. The errors are divided by those with the published gains, which are "
+        "scaled with the mass. A ratio near zero means that the error with the published gains is "
+        "far larger than the force itself, as in an unstable loop:"
     )
     return [
         words,
-        table(("observer", "unstable", "median ratio of errors", "largest ratio"), cells),
+        table(("observer", "unstable benches", "median ratio of errors", "largest ratio"), cells),
         "With the published gains the error is larger than the peak of the force on "
         f"{sum(row['paper'] > 1.0 for row in rows)} of these benches.",
         f"The 95 % intervals of the noise-aware observer contain {held.mean():.1f} % of the true "

@@ -34,19 +34,22 @@ TEXT = """
 The observers follow measured records, and the estimated force is compared with a reference force.
 
 - EMPS is a positioning stage without a spring. Its model has mass and viscous damping, but not the
-  dry friction. The friction force was not measured: the reference is the force smoothed after the
-  run.
-- The MR damper was measured on a dyno with a load cell. From its record, a bench without
+  dry friction. The friction force was not measured: the reference is the force
+  [smoothed after the run](../explanation/observers.md#smoothing-after-the-run).
+- The MR (magnetorheological) damper was measured on a dyno with a load cell. The name of a record
+  contains amplitude, frequency and current (`0x5` is 0.5). From the record, a bench without
   gravity is constructed in which the damper carries a body of 100 kg: the applied force is the
-  force that gives this body the smoothed motion against the measured force of the damper. The
-  observer uses this force and the unsmoothed displacement; the reference is the load cell.
+  force that gives this body the smoothed motion against the measured force of the damper. The model
+  is the body alone, without a damper law. The observer uses the applied force and the unsmoothed
+  displacement; the reference is the load cell.
 
-An error is the RMS error relative to the standard deviation of the reference force. A first
-pass with an untuned noise-aware observer determines the longest section in which it is never
-interrupted; the error is evaluated at the valid ticks of this section, without its first 0.5 s.
+An error is the RMS error relative to the standard deviation of the reference force. The noise is
+the standard deviation of the noise in the measured height. A first pass with an untuned noise-aware
+observer determines the longest section in which its estimate is always valid; the error of each
+observer is evaluated at its valid ticks in this section, without the first 0.5 s of the section.
 The share of valid ticks is in parentheses if it is below 100 %. `lost` stands for an error of
 more than twice the standard deviation. The observers are tuned on the record on which they are
-evaluated.
+evaluated; the published gains are scaled with the mass.
 """
 
 MODEL = """

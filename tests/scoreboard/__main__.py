@@ -13,7 +13,7 @@ from tests.scoreboard.run import run_scoreboard
 from tests.scoreboard.table import page
 
 TEXT = """
-Published data of measured benches are diagnosed with `rig diagnose`. Its nominal model is the start
+Published data of measured benches are diagnosed with `rig diagnose`. The nominal model is the start
 model; the last column states where the parameters of this model are from. Laws and parameters are
 searched for and fitted on the training data. The test data decide two things afterwards: if all
 data are described as well without the laws, these are removed; and with the verdict
@@ -24,7 +24,8 @@ Each table contains one data set, with one row per model and one column per test
 models called `rig` were computed here; the others were published in the source in the last column.
 
 EMPS is an electro-mechanical positioning stage without a spring (Janot, Gautier, Brunot 2019). Its
-recordings `train` and `pulses` are each used once for training and once for the test.
+recordings `train` and `pulses` are each used once for training and once for the test. dynoNet is a
+neural network without a physical model.
 """
 
 
