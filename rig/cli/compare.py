@@ -102,7 +102,7 @@ def _print(
     summary: str,
     tables: "tuple[ComparisonTable, ComparisonTable]",
 ) -> None:
-    from rig.dyno.comparison import steps_without_partner
+    from rig.dyno.comparison import list_not_comparable
 
     print_text(f"{summary[:1].upper()}{summary[1:]}.")
     changed, others = tables
@@ -114,5 +114,5 @@ def _print(
             f"{row.figure} ({others.heads[-1].lower()} {row.cells[-1]})" for row in others.rows
         )
         print_text(f"{others.title}: {'; '.join(texts)}.")
-    for text in steps_without_partner(records):
+    for text in list_not_comparable(records):
         print_text(f"- not comparable: {text}")

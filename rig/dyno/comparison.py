@@ -18,7 +18,7 @@ from scipy.special import ndtr  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.figures import DynoStep
+from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure, student_factor
 
 _ALIKE = 0.1
@@ -125,16 +125,25 @@ def _relative_difference(step: DynoStep, reference: DynoStep) -> float:
     )
 
 
-def steps_without_partner(items: Sequence[Characteristics]) -> list[str]:
-    """Steps that have no partner of their speed and amplitude in every other record, in words."""
+def list_not_comparable(items: Sequence[Characteristics]) -> list[str]:
+    """Steps without a partner of their speed and amplitude, and clipped forces, in words."""
     return [
-        f"{item.name}, ±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s: no "
-        f"such step in {other.name}"
-        for item in items
-        for other in items
-        if other is not item
-        for step, partner in pair_steps(item, other)
-        if partner is None
+        *(
+            f"{item.name}, ±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s: "
+            f"no such step in {other.name}"
+            for item in items
+            for other in items
+            if other is not item
+            for step, partner in pair_steps(item, other)
+            if partner is None
+        ),
+        *(
+            f"{item.name}, {side} at {step.peak_speed_m_per_s:.3g} m/s: its force was clipped"
+            for item in items
+            for step in item.steps
+            for side, stroke in zip(SIDES, step.strokes, strict=True)
+            if stroke.is_clipped
+        ),
     ]
 
 
@@ -187,7 +196,11 @@ def _figures_by_name(
             f"spring rate {at}": ("N/m", step.spring_rate_n_per_m),
             f"hysteresis at the turning points {at}": ("N", step.hysteresis_at_zero_n),
         }
-    return {name: (unit, figure) for name, (unit, figure) in figures.items() if figure is not None}
+    return {
+        name: (unit, figure)
+        for name, (unit, figure) in figures.items()
+        if figure is not None and figure.is_bounded
+    }
 
 
 def _standard_deviation(figure: Figure) -> float:

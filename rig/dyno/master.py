@@ -130,11 +130,16 @@ def master_of(record: Characteristics) -> Master:
 
 
 def refuse_unsuitable(record: Characteristics) -> None:
-    """Refuse a record in which faults cannot be identified: wrong sign of force, constant speed.
+    """Refuse a record in which faults cannot be identified: clipped, wrong sign, constant speed.
 
     Raises:
         InputError: It is such a record.
     """
+    if any(stroke.is_clipped for step in record.steps for stroke in step.strokes):
+        raise InputError(
+            f"{record.name}: the load cell was clipped, expected a record of whole forces: its "
+            "faults would be taken for the damper's"
+        )
     if any(step.energy_per_cycle_j.high < 0.0 for step in record.steps):
         raise InputError(
             f"{record.name}: the strut gives energy, expected the force of a damper (is its sign "

@@ -193,12 +193,12 @@ def _level_of(stroke: MeanStroke) -> float | None:
     if entry < _SLOWEST_ENTRY * peak or peak - entry < _LEAST_PLATEAU * peak:
         return None
     # The slope by speed is the mean of speeding up and slowing down, in which a spring cancels.
-    at = np.arange(inside.start, inside.stop)
-    at = at[speed[at] >= entry + _CORNER * (peak - entry)]
-    about = speed[at] - float(speed[at].mean())
+    at = np.zeros(len(speed), np.bool_)
+    at[inside] = speed[inside] >= entry + _CORNER * (peak - entry)
+    about = np.where(at, speed - float(speed[at].mean()), 0.0)
     row = about / float(about @ about)
-    slope = float(row @ force[at])
-    std = float(row @ stroke.covariance[np.ix_(at, at)] @ row) ** 0.5
+    slope = float(row @ force)
+    std = float(row @ stroke.covariance @ row) ** 0.5
     below = _slope_below(speed, force, entry)
     is_flat = below > 0.0 and slope + 1.96 * std <= _FLAT * below
     return float(force[at].mean()) if is_flat else None

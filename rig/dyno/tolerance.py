@@ -4,6 +4,7 @@ A point passes when its interval lies inside the band, fails when it lies outsid
 the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 2017).
 """
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -77,7 +78,7 @@ class PointVerdict(NamedTuple):
     @property
     def margin_n(self) -> float | None:
         """Distance of the force from the nearer limit, negative beyond it; None if unknown."""
-        if self.force is None:
+        if self.force is None or not self.force.is_bounded:
             return None
         return min(self.force.value - self.low_n, self.high_n - self.force.value)
 
@@ -87,10 +88,15 @@ class PointVerdict(NamedTuple):
         if self.force is None:
             return f"no step at {self.velocity_m_per_s:g} m/s, expected {band}"
         low, high = self.force.low, self.force.high
-        return (
-            f"{self.force.value:.1f} N ({low:.1f} to {high:.1f}), {self.force.method}, "
-            f"expected {band}"
-        )
+        if self.force.is_bounded:
+            shown = f"{self.force.value:.1f} N ({low:.1f} to {high:.1f})"
+        elif math.isfinite(low):
+            shown = f"at least {low:.1f} N, the load cell was clipped"
+        elif math.isfinite(high):
+            shown = f"at most {high:.1f} N, the load cell was clipped"
+        else:
+            shown = "not known, the load cell was clipped"
+        return f"{shown}, {self.force.method}, expected {band}"
 
 
 def load_tolerance(path: Path) -> ToleranceBand:

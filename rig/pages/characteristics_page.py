@@ -1,5 +1,6 @@
 """The damper sheet: verdict, finding, plots and properties on one A4 page, methods on the next."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -44,6 +45,8 @@ _ORDER = ("fail", "not measured", "open", "pass")
 _MOST_POINTS = 16
 """Points beside the plot on one page; those of more urgent verdicts and smaller margins first."""
 
+
+_MISSING = "–"
 
 _MOST_NAMED = 3
 """Points that a sentence names."""
@@ -141,8 +144,11 @@ def _words_of_points(points: Sequence[PointVerdict]) -> str:
 def _forces(record: Characteristics) -> str:
     fastest = max(record.steps, key=lambda step: step.peak_speed_m_per_s)
     forces = (
-        with_unit(three_digits(side.force_at_peak_velocity_n.value), "N")
-        for side in (fastest.compression, fastest.rebound)
+        with_unit(three_digits(figure.value) if figure.is_bounded else with_half(figure), "N")
+        for figure in (
+            fastest.compression.force_at_peak_velocity_n,
+            fastest.rebound.force_at_peak_velocity_n,
+        )
     )
     steps = "one step" if len(record.steps) == 1 else f"{len(record.steps)} steps"
     speed = with_unit(three_digits(fastest.peak_speed_m_per_s), "m/s")
@@ -237,9 +243,18 @@ def _row(name: str, figure: Figure, unit: str) -> tuple[str, str, str, str]:
 
 def text_of(figure: Figure, unit: str) -> str:
     """A figure with half of its interval and its unit."""
-    return with_unit(with_half(figure), unit)
+    text = with_half(figure)
+    return text if text == _MISSING else with_unit(text, unit)
 
 
 def with_half(figure: Figure) -> str:
-    """A figure with half of its interval, with the digits that the interval justifies."""
-    return plus_minus(figure.value, 0.5 * (figure.high - figure.low))
+    """A figure with half of its interval, with the digits that the interval justifies.
+
+    A figure with one end is a bound; one without ends is missing.
+    """
+    if figure.is_bounded:
+        return plus_minus(figure.value, 0.5 * (figure.high - figure.low))
+    bound = next((end for end in (figure.low, figure.high) if math.isfinite(end)), math.nan)
+    if math.isnan(bound):
+        return _MISSING
+    return f"{'≥' if bound == figure.low else '≤'}\u00a0{three_digits(bound)}"

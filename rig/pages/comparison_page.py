@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rig.dyno.characterise import Characteristics
-from rig.dyno.comparison import Difference, Trend, pair_steps, steps_without_partner
+from rig.dyno.comparison import Difference, Trend, list_not_comparable, pair_steps
 from rig.dyno.report import DamperReport
 from rig.pages.characteristics_page import SIGNS, signed, text_of
 from rig.pages.damper_pictures import draw_damper
@@ -48,7 +48,7 @@ def write_comparison_page(
         summary=summary,
         pictures=draw_damper([DamperReport(record) for record in records]),
         tables=[table for table in tables if table.rows],
-        missing=steps_without_partner(records),
+        missing=list_not_comparable(records),
         signs=SIGNS,
     )
     write_page(text, path)
@@ -132,7 +132,7 @@ def _most(item: Difference) -> str:
 
 
 def _not_comparable(records: Sequence[Characteristics]) -> str:
-    """How many steps are not comparable, or that the tests have none in common."""
+    """How many steps and forces are not comparable, or that the tests have no step in common."""
     first, *others = records
     shared = [
         all(pair is not None for pair in of)
@@ -140,8 +140,8 @@ def _not_comparable(records: Sequence[Characteristics]) -> str:
     ]
     if not any(shared):
         return "the tests share no step"
-    missing = len(steps_without_partner(records))
-    return f"{_count(missing, 'step')} not comparable" if missing else "every step was compared"
+    missing = len(list_not_comparable(records))
+    return f"{missing} not comparable" if missing else "every step was compared"
 
 
 def _count(number: int, what: str) -> str:

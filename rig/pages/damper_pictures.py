@@ -158,11 +158,19 @@ def _draw_peaks(axes: Any, reports: Sequence[DamperReport], units: PlotUnits) ->
         item, (colour, dash) = report.characteristics, _look(index)
         for side, marker in zip(SIDES, ("o", "s"), strict=True):
             speeds, forces_n, halves_n = _peaks(item, side, units)
+            is_bound = ~np.isfinite(halves_n).all(axis=0)
+            halves_n = np.where(np.isfinite(halves_n), halves_n, 0.0)
             name = item.name if side == SIDES[0] else None
             axes.errorbar(
                 speeds, forces_n, yerr=halves_n, color=colour, linestyle=dash, capsize=2.5,
                 linewidth=1.4, marker="." if report.points else marker, markersize=5, label=name,
             )  # fmt: skip
+            if is_bound.any():
+                arrow = {"marker": "^" if side == SIDES[0] else "v", "markersize": 9}
+                axes.plot(
+                    speeds[is_bound], forces_n[is_bound], color=colour, linestyle="", **arrow,
+                    label="clipped: at least this",
+                )  # fmt: skip
     _draw_verdicts(axes, points, units)
     axes.axhline(0.0, color=_AXIS, linewidth=0.8)
     axes.set_xlim(left=0.0)
