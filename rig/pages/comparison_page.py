@@ -141,7 +141,7 @@ def _not_comparable(records: Sequence[Characteristics]) -> str:
     if not any(shared):
         return "the tests share no step"
     missing = len(list_not_comparable(records))
-    return f"{missing} not comparable" if missing else "every step was compared"
+    return f"{_count(missing, 'item')} not comparable" if missing else "every step was compared"
 
 
 def _count(number: int, what: str) -> str:

@@ -140,7 +140,7 @@ def test_the_comparison_counts_what_it_compared(tmp_path):
     slow = with_changes(state(2), steps=state(2).steps[:1])
     fast = with_changes(state(1), steps=state(1).steps[2:])
     assert "the tests share no step" in summarise_differences([], [slow, fast])
-    assert "2 steps not comparable" in summarise_differences([], [state(1), slow])
+    assert "2 items not comparable" in summarise_differences([], [state(1), slow])
     files = [
         str(written(tmp_path / f"{gas}.csv", columns(gas, gas_n=float(gas)))) for gas in (150, 200)
     ]
