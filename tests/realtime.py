@@ -34,7 +34,7 @@ from rig.run.trace import Trace
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig
 from tests.evidence import add_page_option, command_line, table, write_evidence
-from tests.soak import force_error_n, load_cell
+from tests.soak import SETTLING, force_error_n, load_cell
 
 ESTIMATE = SignalName(message="RIG_ESTIMATE", signal="SPRING_DAMPER_FORCE")
 VALID = SignalName(message="RIG_ESTIMATE", signal="VALID")
@@ -52,8 +52,9 @@ SCHED_FIFO.
 The lateness is the time from a tick's deadline to the wake-up of the loop; the work (computing
 time) is the time from the wake-up to the end of the tick. A missed tick is counted and not made up
 for. The force error is the RMS difference between the estimated force and that of the simulated
-bench's load cell, relative to the peak force. The lateness depends on the machine as much as on the
-program, and differs on another machine. No CAN hardware took part.
+bench's load cell, without the first {skipped_s:g} s, relative to the peak force. The lateness
+depends on the machine as much as on the program, and differs on another machine. No CAN hardware
+took part.
 """
 
 _ROUND_NS = 20_000_000
@@ -163,6 +164,7 @@ def write_page(ended: Ended, rate_hz: float, seconds: float, busy: float, error:
             rate_hz=rate_hz,
             seconds=seconds,
             load=load,
+            skipped_s=10 * SETTLING / rate_hz,
             granted="under" if granted else "without",
         ),
         [

@@ -168,7 +168,8 @@ STATUS = (
     _status("state", "number of the mode", lambda report: report.output.mode),
     _status(
         "encoding_saturated",
-        "1 if a value that was sent since the last status was limited to its signal's range",
+        "1 if a value under `publish` was limited to its signal's range since the last status; "
+        "`force_std` and `counter` do not count",
         lambda r: r.counts.saturated > r.reported.saturated,
     ),
     _OVERRUNS,
@@ -206,8 +207,8 @@ STATUS = (
     ),
     _status(
         "bus_fault",
-        "1 if the bus failed, a second sender was detected, or a frame was refused as not "
-        "authentic, since the last status",
+        "1 if the bus failed, the CAN controller was error-passive or bus-off, a second sender was "
+        "detected, or a frame was refused as not authentic, since the last status",
         _is_bus_faulty,
     ),
     _status(

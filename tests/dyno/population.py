@@ -194,8 +194,8 @@ def one(job):
 TEXT = """
 `rig characterise --master` compares a damper with a good one in the same test, and names its fault.
 Here the dampers are simulated with equations other than those of the evaluation: a polytropic gas
-column, a damping law with a sharp knee and, for the faults of that name, aerated oil whose
-stiffness rises with pressure, and free play as a contact.
+column, a damping law with a sharp knee and, for the faults *air in the oil* and *play*, aerated
+oil whose stiffness rises with pressure and free play as a contact.
 
 Gas force and friction, and, independently in rebound and compression, the damping below and above
 the knee and the speed of the knee scatter by {scatter:g} % (standard deviation) from damper to

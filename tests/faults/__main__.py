@@ -18,10 +18,11 @@ FAULTS_TEXT = """
 The bridge runs at 1 kHz with the bench of the reference case. In each row, a test injects one
 fault. Faults of frames, bench, bus, clock and devices are injected in simulated time, 2 s after the
 start; faults of disk and process in runs with a log on the disk. *Within* is the time from the
-fault to the first tick that shows it (for a stuck value and a bench that stops sending, to the safe
-state); *loss* states which data are lost. The force error is the RMS difference
-between the estimated force and that of the simulated bench, over the valid ticks; it is compared
-with that of the same run without the fault. Combinations
+beginning of the fault to the first tick that shows it (for a stuck value and a bench that stops
+sending, to the safe state); if only some of the frames are affected, it includes the wait for the
+first of these. *Loss* states which data are lost. The force error is the RMS difference
+between the estimated force and that of the simulated bench, over the valid ticks after the
+beginning of the fault; *instead of* is the error of the same run without the fault. Combinations
 of faults are not in this table.
 """
 

@@ -337,7 +337,8 @@ def test_sigkill(row, tmp_path):
         17,
         "SIGKILL",
         "the process ends; all frames but those of the last 10 ms are on the disk, and a replay "
-        f"computes from them the ticks that the log does not have (here {recomputed_ms:.0f} ms)",
+        "computes from them the ticks that the log does not have (here those of "
+        f"{recomputed_ms:.0f} ms)",
         "0 ms",
         "frames of the last 10 ms",
     )

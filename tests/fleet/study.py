@@ -45,8 +45,8 @@ for a million runs is a million times this cost per run; this is an upper estima
 further cost of each run does not grow with the number of runs, which was not measured.
 
 The loops and the two campaigns ran one after the other, each under a different load of the machine.
-The throughput depends on this load: a ratio above 1 is its effect. The ratios therefore neither
-measure the cost of distribution nor compare Dask with processes; the CPU times do.
+The throughput depends on this load. A ratio may therefore exceed 1, and the ratios neither measure
+the cost of distribution nor compare Dask with processes; the CPU times do.
 """
 
 
