@@ -314,7 +314,7 @@ class LinkCycles:
 def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge):
     cycles = LinkCycles(bench, 10)
     ended = bridge(bench, 300.0, progress=cycles.see, stop=cycles.are_over)
-    assert ended.state.mode is Mode.RUNNING
+    assert ended.state.mode is Mode.RUNNING, (ended.folder / "events.jsonl").read_text()
     ending = yaml.safe_load((ended.folder / "run.yaml").read_text())["ending"]
     gaps = ending["bus"]["gaps"]
     lengths = [gap["to_s"] - gap["from_s"] for gap in gaps]
