@@ -12,8 +12,10 @@ from rig.cli.terminal import (
     FAILED,
     JsonFlag,
     Labels,
+    LagFlag,
     PrintToo,
     StrutOfRun,
+    ZeroFlag,
     print_json,
     print_table,
     print_text,
@@ -60,6 +62,8 @@ def characterise_command(
         typer.Argument(metavar="RUN", help="Run folders, or CSV files of measured data."),
     ],
     strut: StrutOfRun = None,
+    zero: ZeroFlag = True,
+    lag: LagFlag = True,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for characteristics.json and report.html."),
@@ -81,6 +85,7 @@ def characterise_command(
     --tolerance, the exit code is 1 unless every point of the band passes; with --master, unless the
     damper agrees with the master in all steps of the master's record.
     """
+    from rig.dyno.corrections import WantedCorrections
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
@@ -95,7 +100,8 @@ def characterise_command(
     if junit is not None and tolerance is None and master is None:
         raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    reports = evaluate_records(runs, strut, band, master, scatter)
+    wanted = WantedCorrections(zero, lag)
+    reports = evaluate_records(runs, strut, band, master, scatter, wanted)
     content = content_of(reports, serial, band)
     if out is not None:
         write_content(content, out)

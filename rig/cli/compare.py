@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import JsonFlag, Labels, StrutOfRun, print_json, print_table, print_text
+from rig.cli.terminal import (
+    JsonFlag,
+    Labels,
+    LagFlag,
+    StrutOfRun,
+    ZeroFlag,
+    print_json,
+    print_table,
+    print_text,
+)
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics
@@ -32,6 +41,8 @@ def compare_command(
         ),
     ] = None,
     strut: StrutOfRun = None,
+    zero: ZeroFlag = True,
+    lag: LagFlag = True,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for comparison.json and report.html."),
@@ -46,6 +57,7 @@ def compare_command(
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, trends_over_dose
+    from rig.dyno.corrections import WantedCorrections
     from rig.files.folders import refuse_full
     from rig.pages.comparison_page import (
         difference_tables,
@@ -62,7 +74,8 @@ def compare_command(
     if out is not None:
         refuse_full(out)
     labels = parse_labels(label or [])
-    records = [characterise(path, strut) for path in runs]
+    wanted = WantedCorrections(zero, lag)
+    records = [characterise(path, strut, wanted) for path in runs]
     if dose:
         trends = trends_over_dose(records, dose)
         content = {"schema": 1, "trends": trends}

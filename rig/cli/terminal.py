@@ -32,6 +32,20 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.
 StrutOfRun = Annotated[
     str | None, typer.Option(metavar="NAME", help="Strut of the run, if there are several.")
 ]
+ZeroFlag = Annotated[
+    bool,
+    typer.Option(
+        "--zero/--no-zero",
+        help="Remove a drift of the load cell's zero, where rests and cycles show one.",
+    ),
+]
+LagFlag = Annotated[
+    bool,
+    typer.Option(
+        "--lag/--no-lag",
+        help="Remove the time by which the force lags the height, where the steps show one.",
+    ),
+]
 Labels = Annotated[
     list[str] | None,
     typer.Option(

@@ -1,18 +1,27 @@
 """From a recording to the figures of its damper."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from can_dbc.errors import InputError, expected_name
+from rig.dyno.corrections import (
+    ALL_CORRECTIONS,
+    NO_CORRECTIONS,
+    Corrections,
+    WantedCorrections,
+    decide,
+)
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.sensor_faults import find_level_limits, judge_sensors
 from rig.dyno.stroke_force import ForceRange
-from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
+from rig.dyno.strokes import Array, Block, find_blocks, find_holds, find_strokes
 from rig.dyno.timeline import Span, account
+from rig.dyno.zero_drift import estimate_drift
 from rig.log.reader import read_run
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
@@ -25,6 +34,7 @@ class Characteristics:
     """Figures of a damper from one record.
 
     Attributes:
+        corrections: What of lag and drift was removed from its force.
         quality: What in the record may mislead.
         account: The whole record as steps, rests, transitions, and what was rejected and why.
     """
@@ -33,6 +43,7 @@ class Characteristics:
     steps: tuple[DynoStep, ...]
     holds: tuple[AtRest, ...]
     damper: Damper
+    corrections: Corrections
     quality: tuple[str, ...]
     account: tuple[Span, ...]
 
@@ -52,6 +63,7 @@ class Characteristics:
             "signs": "positive when the strut pushes: damping of compression positive",
             "steps": [step.figures() for step in self.steps],
             "holds": self.holds,
+            "corrections": self.corrections.as_dict(),
             **figures,
             "account": self.account,
             "quality": self.quality,
@@ -59,10 +71,12 @@ class Characteristics:
         }
 
 
-def characterise(path: Path, strut: str | None = None) -> Characteristics:
+def characterise(
+    path: Path, strut: str | None = None, wanted: WantedCorrections = ALL_CORRECTIONS
+) -> Characteristics:
     """Figures of a damper from a run's folder or a CSV of measured data.
 
-    `strut` may be None where a run has only one.
+    `strut` may be None where a run has only one; the wanted corrections are applied.
 
     Raises:
         InputError: There is no such record, or no cycle in it repeats.
@@ -80,11 +94,14 @@ def characterise(path: Path, strut: str | None = None) -> Characteristics:
             warm_c,
             name,
             source,
-        )
+        ),
+        wanted,
     )
 
 
-def characterise_record(record: ForceRecord) -> Characteristics:
+def characterise_record(
+    record: ForceRecord, wanted: WantedCorrections = ALL_CORRECTIONS
+) -> Characteristics:
     """Figures of a damper from its record, without missing values.
 
     Raises:
@@ -94,32 +111,46 @@ def characterise_record(record: ForceRecord) -> Characteristics:
     t_s, height_m = record.t_s, record.height_m
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(t_s, height_m, strokes)
-    computed = [(block, compute_step(record, block, faults.limits)) for block in blocks]
-    levels = find_level_limits(
-        [stroke for _, step in computed if not isinstance(step, str) for stroke in step.strokes]
-    )
-    if levels != ForceRange():
-        faults = faults._replace(limits=faults.limits.within(levels))
-        computed = [(block, compute_step(record, block, faults.limits)) for block in blocks]
-    kept = [(block, step) for block, step in computed if not isinstance(step, str)]
+    rests = find_holds(t_s, height_m, blocks)
+    kept, rejected = _compute_steps(record, blocks, faults.limits, NO_CORRECTIONS)
+    levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
+    faults = faults._replace(limits=faults.limits.within(levels))
+    drift = estimate_drift(record, blocks, [compute_rest(record, here) for here in rests])
+    corrections = decide(wanted, record, [step for _, step in kept], drift)
+    if levels != ForceRange() or corrections.any:
+        record = corrections.apply(record)
+        kept, rejected = _compute_steps(record, blocks, faults.limits, corrections)
     if not kept:
         raise InputError(
             f"{record.name}: no steady cycle in {len(strokes)} strokes: never three in a row of "
             f"equal amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
             "repeats its cycles"
         )
-    rests = find_holds(t_s, height_m, blocks)
     holds = tuple(compute_rest(record, here) for here in rests)
     marked = mark_warm_up([step for _, step in kept])
-    rejected = {
-        stroke.first: why
-        for block, why in computed
-        if isinstance(why, str)
-        for stroke in block.strokes
-    }
     spans = account(t_s, strokes, [block for block, _ in kept], rejected, rests)
-    warnings = quality(record, marked, holds, spans, faults)
-    return Characteristics(record, marked, holds, summarise_damper(marked), warnings, spans)
+    warnings = quality(record, marked, spans, faults, corrections)
+    damper = summarise_damper(marked)
+    return Characteristics(record, marked, holds, damper, corrections, warnings, spans)
+
+
+def _compute_steps(
+    record: ForceRecord,
+    blocks: Sequence[Block],
+    limits: ForceRange,
+    corrections: Corrections,
+) -> tuple[list[tuple[Block, DynoStep]], dict[int, str]]:
+    """Blocks with their figures, and why others have none by the first sample of their strokes."""
+    kept: list[tuple[Block, DynoStep]] = []
+    rejected: dict[int, str] = {}
+    for block in blocks:
+        times_s = record.t_s[block.begin : block.end]
+        step = compute_step(record, block, corrections.limits_in(limits, times_s))
+        if isinstance(step, str):
+            rejected |= {stroke.first: step for stroke in block.strokes}
+        else:
+            kept.append((block, step))
+    return kept, rejected
 
 
 def _read_strut(

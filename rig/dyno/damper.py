@@ -122,15 +122,22 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
 
 
 def spring_curve(step: DynoStep) -> np.polynomial.Polynomial:
-    """Force of gas and spring over height: the mean of both strokes of a slow step.
+    """Force of gas and spring over height, from the mean of both strokes of a slow step.
 
-    Friction and damping of like size in both directions cancel in it.
+    Friction cancels in it, and damping but for what it differs by in both directions, which is
+    proportional to the speed there.
     """
     down, up = step.strokes
     inner = np.abs(np.sin(ANGLES)) <= _INNER
     # At one height one stroke is at an angle, and the other at its negative.
-    mean_n = 0.5 * (down.force_n + up.force_n[::-1])
-    return np.polynomial.Polynomial.fit(down.height_m[inner], mean_n[inner], _SPRING_DEGREE)
+    mean_n = 0.5 * (down.force_n + up.force_n[::-1])[inner]
+    share = np.sin(ANGLES)[inner]
+    powers = share[:, None] ** np.arange(_SPRING_DEGREE + 1)
+    speed = np.abs(down.velocity_m_per_s)[inner]
+    weights = np.linalg.lstsq(np.column_stack([powers, speed]), mean_n, rcond=None)[0][:-1]
+    # Compression goes downwards: the share of the stroke counts from the middle in its direction.
+    ends_m = [down.middle_m - sign * down.sign * down.amplitude_m for sign in (1.0, -1.0)]
+    return np.polynomial.Polynomial(weights, domain=ends_m, window=[-1.0, 1.0])
 
 
 def mark_warm_up(steps: Sequence[DynoStep]) -> tuple[DynoStep, ...]:

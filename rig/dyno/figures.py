@@ -206,7 +206,9 @@ def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoS
 
 def compute_rest(record: ForceRecord, here: slice) -> AtRest:
     """Mean height, force and temperature of the samples `here`, at which the strut rests."""
-    values, warm_c = record.force_n[here], record.temperature_c
+    # A lag of the cell, and oil that relaxes, last into the rest.
+    settled = slice(here.start + (here.stop - here.start) // _BATCHES, here.stop)
+    values, warm_c = record.force_n[settled], record.temperature_c
     means = np.array([part.mean() for part in np.array_split(values, min(_BATCHES, len(values)))])
     std = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else float("nan")
     mean, half = float(values.mean()), 2.26 * std  # Student's t of ten batches

@@ -1,11 +1,11 @@
 """Warnings about a record that may mislead, in words."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 
-from rig.dyno.figures import SIDES, AtRest, DynoStep, ForceRecord
+from rig.dyno.corrections import Corrections
+from rig.dyno.figures import SIDES, DynoStep, ForceRecord
 from rig.dyno.sensor_faults import SensorFaults
 from rig.dyno.stroke_force import FINE, MeanStroke
 from rig.dyno.strokes import Array
@@ -17,9 +17,6 @@ _GAP = 2.5
 
 _FEW_A_CYCLE = 16.0
 """Samples of a cycle below which a stroke has hardly eight: its shape is mostly the spline's."""
-
-_SAME_HEIGHT_M = 5e-4
-"""By which rests of one height may differ: of a gas spring of 2 N/mm that is 1 N."""
 
 _COARSE = 2.0
 """Steps of a channel over its noise from which on the steps are what is seen."""
@@ -39,23 +36,24 @@ _CERTAIN = 5.0
 def quality(
     record: ForceRecord,
     steps: Sequence[DynoStep],
-    holds: Sequence[AtRest],
     spans: Sequence[Span],
     faults: SensorFaults,
+    corrections: Corrections,
 ) -> tuple[str, ...]:
     """Warnings of gaps, few samples, coarse steps, a wrong sign, drift, poor fits, what is unused.
 
-    `spans` account for the whole record, `faults` are those of its sensors.
+    `spans` account for the whole record, `faults` are those of its sensors, and `corrections` what
+    was done about drift and lag.
     """
     t_s, force_n = record.t_s, record.force_n
     return (
         *_sign(steps),
         *faults.words(),
+        *corrections.words(),
         *(words(span) for span in spans if span.use == "rejected"),
         *preflight(t_s, {"height": record.height_m}),
         *_few_samples(t_s, steps),
         *_coarse(force_n),
-        *_drift(holds),
         *_left_samples(steps),
     )
 
@@ -121,23 +119,6 @@ def _coarse(force_n: Array) -> Iterator[str]:
     noise = float(np.median(np.abs(np.diff(force_n, 2)))) / 0.6745 / 6.0**0.5
     if step >= _COARSE * max(noise, 1e-12):
         yield f"the force comes in steps of {step:.3g} N, more than its noise"
-
-
-def _drift(holds: Sequence[AtRest]) -> Iterator[str]:
-    """The two rests at one height whose forces differ most, if by more than their intervals."""
-    changes = [
-        (later.force_n.value - earlier.force_n.value, earlier, later)
-        for earlier, later in combinations(holds, 2)
-        if abs(later.height_m - earlier.height_m) <= _SAME_HEIGHT_M
-        and (later.force_n.low > earlier.force_n.high or later.force_n.high < earlier.force_n.low)
-    ]
-    if changes:
-        change_n, earlier, later = max(changes, key=lambda item: abs(item[0]))
-        yield (
-            f"the force at rest at {1e3 * earlier.height_m:.1f} mm changed by {change_n:+.3g} N "
-            f"from {earlier.begin_s:.1f} s to {later.begin_s:.1f} s: gas that warms, friction that "
-            "holds another way, or a cell that drifts"
-        )
 
 
 def _left_samples(steps: Sequence[DynoStep]) -> Iterator[str]:

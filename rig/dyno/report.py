@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics, characterise
+from rig.dyno.corrections import ALL_CORRECTIONS, WantedCorrections
 from rig.dyno.faults import MasterComparison, name_faults
 from rig.dyno.master import master_of
 from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
@@ -79,19 +80,23 @@ def evaluate_records(
     band: ToleranceBand | None,
     master: Path | None,
     scatter: float,
+    wanted: WantedCorrections = ALL_CORRECTIONS,
 ) -> list[DamperReport]:
     """Reports of several records, folders of runs or CSV files, against a band and a master.
 
     `strut` may be None where a run has only one. The master is the record of a good damper in the
-    same test, `scatter` the relative standard deviation of each property among good dampers.
+    same test, `scatter` the relative standard deviation of each property among good dampers. The
+    lag that is removed from a record is then the master's: what is more in one of them is a fault.
 
     Raises:
         InputError: A record cannot be characterised, or not be compared with the master.
     """
     if master is not None and any(path.resolve() == master.resolve() for path in paths):
         raise InputError(f"--master {master}: is the record itself, expected that of a good damper")
-    records = [characterise(path, strut) for path in paths]
-    good = None if master is None else characterise(master, strut)
+    good = None if master is None else characterise(master, strut, wanted)
+    if good is not None:
+        wanted = wanted._replace(lag_s=good.corrections.removed_lag_s)
+    records = [characterise(path, strut, wanted) for path in paths]
     model = None if good is None else master_of(good)
     return [
         DamperReport(

@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
@@ -28,8 +27,6 @@ from rig.dyno.strokes import Array
 from rig.recordings.clipping import find_sudden_plateaus
 from rig.recordings.stretches import find_stretches
 
-Flags = NDArray[np.bool_]
-
 _LARGEST_N = 1e8
 """Ten times what the largest damper machines of civil engineering reach."""
 
@@ -38,6 +35,9 @@ _LARGEST_STROKE_M = 5.0
 
 _WINDOW = 7
 """Samples of the running median: a spike of three is its minority."""
+
+_LONGEST = 3
+"""Samples of a spike at most."""
 
 _USUAL, _BEYOND = 0.995, 4.0
 """Quantile of the distances from the running median, and how many times of it a spike has: the
@@ -116,10 +116,11 @@ def judge_sensors(record: ForceRecord) -> tuple[ForceRecord, SensorFaults]:
     spikes: dict[str, list[tuple[float, float]]] = {}
     for name, values in channels.items():
         found = find_spikes(values)
-        is_spike |= found
+        for spike in found:
+            is_spike[spike] = True
         spikes[name] = [
             (float(record.t_s[it.start]), float(values[it.start] - values[it.start - 1]))
-            for it in find_stretches(found)
+            for it in found
         ]
     cleaned = record.without(is_spike)
     return cleaned, SensorFaults(spikes, find_plateau_limits(cleaned.force_n))
@@ -142,16 +143,23 @@ def refuse_implausible(name: str, height_m: Array, force_n: Array) -> None:
         )
 
 
-def find_spikes(values: Array) -> Flags:
-    """Samples that stand alone far from their neighbours, of a channel (N,) without missing values.
+def find_spikes(values: Array) -> list[slice]:
+    """Stretches of up to three samples that stand alone, far from both neighbours.
 
-    Returns:
-        Whether a sample is part of a spike, shape (N,): none if there are more than twenty spikes.
+    The channel has the shape (N,), all finite. With more than twenty of them none is a spike.
     """
     distance = np.abs(values - median_filter(values, _WINDOW, mode="nearest"))
-    is_spike = distance > _BEYOND * float(np.quantile(distance, _USUAL))
-    is_rare = len(find_stretches(is_spike)) <= _MOST_SPIKES
-    return is_spike if is_rare else np.zeros(len(values), np.bool_)
+    least = _BEYOND * float(np.quantile(distance, _USUAL))
+    beside = np.pad(values, 1, mode="edge")
+    spikes: list[slice] = []
+    for found in find_stretches(distance > least):
+        # It leaves one neighbour and returns to the other; a jump to another level does not.
+        leaves = float(values[found.start] - beside[found.start])
+        returns = float(values[found.stop - 1] - beside[found.stop + 1])
+        is_short = found.stop - found.start <= _LONGEST
+        if is_short and leaves * returns > 0.0 and min(abs(leaves), abs(returns)) > least:
+            spikes.append(found)
+    return spikes if len(spikes) <= _MOST_SPIKES else []
 
 
 def find_plateau_limits(force_n: Array) -> ForceRange:
