@@ -110,8 +110,10 @@ class Supervision(BaseModel):
 
     Attributes:
         stale_after_s: Age of a height (on a dyno also of the load cell's force) from which the
-            estimate is invalid (HOLD). For the applied force, the age is three cycles of its
-            message, if these are longer.
+            estimate is invalid with the mode HOLD. For the applied force, the age is three cycles
+            of its message, if these are longer. On a dyno, the estimate is invalid (SETTLING)
+            already from an age of three sampling intervals (for a height, plus `delay_s`), if
+            this is less than `stale_after_s`.
         safe_after_s: Age of a height, of the applied force or (on a dyno) of the load cell's force
             from which the bridge enters the safe state. If three cycles of the applied force are
             longer than `stale_after_s`, they extend this age for the applied force by the
@@ -120,7 +122,8 @@ class Supervision(BaseModel):
             an estimate is valid. By default, with `pi`, the time after which the error that a step
             of the residual force causes in the closed loop has decayed to a hundredth of the step;
             with `kalman`, 1.27 / `bandwidth_hz` after the variance of the filter is steady. On a
-            dyno, nine times `prescribed_motion.settling_s`, whatever this key is.
+            dyno, `supervision.settling_s` has no effect: the time is nine times
+            `prescribed_motion.settling_s`.
         overload_share: The estimate is invalid (HOLD) while more than this share of the last few
             hundred ticks was missed.
         arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: in addition,

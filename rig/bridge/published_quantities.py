@@ -230,7 +230,7 @@ def _timing(key: str, meaning: str, value: Callable[[TimingFigures], float]) -> 
         Dimension.TIME,
         lambda report, _: value(report.conditions.timing),
         key.upper(),
-        meaning,
+        f"{meaning} since the start",
         stops_at_range=True,
     )
 

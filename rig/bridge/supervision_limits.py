@@ -85,10 +85,11 @@ class Limit(BaseModel):
             ends (the safe state lasts until it is acknowledged); by default `for_s`, and at least
             1 s for `force_difference_n`, because a wrong force that oscillates crosses the right
             one.
-        action: Every action sets `limit_fault` in the status; `warn` does nothing else. `refuse`
-            also refuses the frame of a measurement. `hold` makes the estimate invalid while the
-            value is beyond the limit; `safe` enters the safe state. For a measurement, `hold` and
-            `safe` refuse its frame, too.
+        action: Every action sets `limit_fault` in the status, counts the ticks beyond the limit
+            (`limited` in `run.yaml`), and begins an excerpt if `log.most_captures` permits one;
+            `warn` does not affect the estimate. `refuse` also refuses the frame of a measurement.
+            `hold` makes the estimate invalid while the value is beyond the limit; `safe` enters
+            the safe state. For a measurement, `hold` and `safe` refuse its frame, too.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -78,7 +78,7 @@ def import_command(
 ) -> None:
     """Import a table as CSV, a bus log or an export as a run, or an FMU as a model.
 
-    A table (text, XLSX, TDMS, MF4) requires --mapping, an MTS table either --mapping or
+    A table (text, XLSX, TDMS, MF4) requires --mapping; an MTS table requires either --mapping or
     --rebound. A bus log (BLF, ASC, candump, TRC, MF4) requires --config. A run that `rig export`
     wrote as MF4 or Parquet requires neither; a run that it wrote as CSV need not be imported. With
     --fmu, SOURCE is a functional mock-up unit (FMU). An FMU contains a program:

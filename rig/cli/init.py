@@ -72,7 +72,8 @@ LengthAtRest = Annotated[
         min=1e-3,
         max=100.0,
         help="Length of the strut at rest, in m. Without --free-length-m, the free length follows "
-        "from it; the strut is then assumed to carry the weight alone (with --dyno: no load).",
+        "from it; the strut is then assumed to carry the weight and no other force (with "
+        "--dyno: no load at all).",
     ),
 ]
 FreeLength = Annotated[

@@ -45,12 +45,12 @@ Run = Annotated[
 ]
 ResidualRms = Annotated[
     float | None,
-    typer.Option(metavar="N", min=0.0, help="Without a run: RMS of the residual force."),
+    typer.Option(metavar="N", min=1e-6, help="Without a run: RMS of the residual force."),
 ]
 HighestFrequency = Annotated[
     float | None,
     typer.Option(
-        metavar="HZ", min=0.0, help="Without a run: highest frequency of the residual force."
+        metavar="HZ", min=1e-6, help="Without a run: highest frequency of the residual force."
     ),
 ]
 NoiseStd = Annotated[
@@ -171,8 +171,8 @@ def _source(
                 "--up-to-hz and --noise-std-m"
             )
         return run
-    if not residual_n or not up_to_hz:
-        raise InputError("expected --run RUN, or --residual-n and --up-to-hz above zero")
+    if residual_n is None or up_to_hz is None:
+        raise InputError("expected --run RUN, or --residual-n and --up-to-hz")
     return StatedExpectation(residual_n, up_to_hz, noise_std_m)
 
 

@@ -48,7 +48,7 @@ _SENTENCES: Mapping[str, str] = {
     Event.TICKS_MISSING.value: "the loop stood still for",
     Event.STALE.value: "no valid measurement for",
     Event.TIMEOUT.value: "no valid measurement for",
-    Event.OVERLOADED.value: "too many cycles missed:",
+    Event.OVERLOADED.value: "too many ticks missed:",
     Event.DIVERGED.value: "the model diverged",
     Event.UNSETTLED.value: "the estimate was disturbed",
     Event.DEVICE_FAULT.value: "a device reports a fault",
@@ -75,13 +75,13 @@ _QUANTITIES: Mapping[str, tuple[str, str]] = {
     "unchanged_s": ("time without a change", "s"),
     "age_s": ("age of the measurement", "s"),
     "gap_s": ("gap", "s"),
-    "missed_share": ("share of cycles missed", "%"),
+    "missed_share": ("share of missed ticks", "%"),
 }
 """Quantities of causes and limits, with their units in SI."""
 
 
 COUNT_WORDS: Mapping[str, str] = {
-    "overruns": "cycles missed",
+    "overruns": "ticks missed",
     "lost": "frames lost (by their counters)",
     "saturated": "frames sent with a value at the limit of its range",
     "stale": "ticks in HOLD",

@@ -153,7 +153,7 @@ MOTION_COLUMNS = {"velocity_m_per_s": VELOCITY, "height_m": HEIGHT}
 """Columns of a strut over which the live page plots its force."""
 
 MODE_COLUMN = "mode"
-FAULT_COLUMNS = {"overruns": "cycles missed", "log_fault": "log fault", "bus_fault": "bus fault"}
+FAULT_COLUMNS = {"overruns": "ticks missed", "log_fault": "log fault", "bus_fault": "bus fault"}
 """Columns that mark a fault where they are above zero, with their labels."""
 
 TICK_CURVES = ("lateness", "work")

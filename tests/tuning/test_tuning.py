@@ -282,8 +282,10 @@ def test_a_second_tuning_hardly_helps_and_another_model_is_written(late, monkeyp
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
-        ((), "expected --run RUN, or --residual-n and --up-to-hz above zero"),
+        ((), "expected --run RUN, or --residual-n and --up-to-hz"),
         (("--residual-n", 5), "expected --run RUN"),
+        (("--residual-n", 0, "--up-to-hz", 5), "--residual-n 0: expected greater than"),
+        (("--residual-n", 5, "--up-to-hz", 0), "--up-to-hz 0: expected greater than"),
         (("--run", "{run}", "--residual-n", 5), "--run: contains what is to be expected"),
         (("--run", "{run}", "--observer", "luenberger"), "expected one of pi, kalman"),
         (("--run", "{folder}"), "run.yaml"),
