@@ -53,6 +53,10 @@ _RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
 _ANGLE_NODES, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
 """Angles and weights of an integral over a stroke."""
 
+_MOST_A_CYCLE = 1600
+"""Samples of a cycle beyond which means of several are taken: within a quarter of a degree a force
+is straight, and the means have what the samples said."""
+
 _BATCHES = 10
 """Parts of a rest whose means give the uncertainty of its mean: noise may be correlated within one
 (Law, Simulation Modeling and Analysis, 2015, 9.5.3)."""
@@ -168,11 +172,15 @@ class DynoStep(NamedTuple):
 
 def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoStep | str:
     """Figures of a block, or why it has none; of a load cell that is clipped at the limits."""
-    t_s, height_m, here = record.t_s, record.height_m, slice(block.begin, block.end)
-    force_n = record.force_n[here]
-    warm_c = None if record.temperature_c is None else record.temperature_c[here]
-    motion = fit_motion(t_s[here], height_m[here], round(2.0 * block.cycles))
-    if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
+    t_s, warm_c = record.t_s, record.temperature_c
+    share = max(1, int((block.end - block.begin) / block.cycles / _MOST_A_CYCLE))
+    times_s, heights_m, force_n = (
+        _thinned(values[block.begin : block.end], share)
+        for values in (t_s, record.height_m, record.force_n)
+    )
+    warm_c = None if warm_c is None else _thinned(warm_c[block.begin : block.end], share)
+    motion = fit_motion(times_s, heights_m, round(2.0 * block.cycles))
+    if np.isnan(motion.period_s) and not is_repetition(t_s, record.height_m, block):
         return f"{len(block.strokes)} strokes of one amplitude that do not repeat one motion"
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
@@ -202,6 +210,12 @@ def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoS
             _warmth(up, motion, force_n, turned, warm_c),
         ),
     )
+
+
+def _thinned(values: Array, share: int) -> Array:
+    """Means of some samples in a row, shape (N / share,)."""
+    kept = len(values) // share * share
+    return np.asarray(values[:kept].reshape(-1, share).mean(axis=1), np.float64)
 
 
 def compute_rest(record: ForceRecord, here: slice) -> AtRest:

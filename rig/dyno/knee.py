@@ -42,6 +42,9 @@ _MISFIT = 0.003
 _KNEES = 240
 """Knees that are tried, evenly spread by their logarithm: over two decades 2 % apart."""
 
+_FEWEST = 6
+"""Speeds from which on a knee is looked for: two lines that meet have four parameters."""
+
 _LOWEST, _HIGHEST = 1.15, 0.9
 """Times the slowest and share of the fastest speed between which a knee is searched."""
 
@@ -59,16 +62,18 @@ def find_knee(strokes: Sequence[MeanStroke], spring: Callable[[Array], Array]) -
 
     `spring` gives the spring force at heights, which is removed from each stroke.
     """
+    if not strokes:
+        return None
     points = [_points(stroke, spring) for stroke in strokes]
     speed, force_n = (np.concatenate([item[i] for item in points]) for i in (0, 1))
-    if not len(speed):
+    if len(speed) < _FEWEST:
         return None
     whitening = _whitening([covariance for *_, covariance in points], force_n)
     target = whitening @ force_n
     lines = whitening @ np.column_stack([np.ones_like(speed), speed])
     tried = np.geomspace(_LOWEST * float(speed.min()), _HIGHEST * float(speed.max()), _KNEES)
     freedom = len(target) - 4
-    if freedom < 1 or tried[-1] <= tried[0]:
+    if tried[-1] <= tried[0]:
         return None
     bends = whitening @ np.maximum(speed[:, None] - tried, 0.0)
     fits = [_fit(np.column_stack([lines, bend]), target) for bend in bends.T]

@@ -52,8 +52,9 @@ _TOP_SHARE, _TOP_STDS = 0.004, 4.0
 _FASTEST = 0.9
 """Share of the peak speed above which the median of a mean stroke is the level it may stay at."""
 
-_ROUNDED = 0.02
-"""Share of a level by which a mean stroke may exceed it: a spline overshoots at a corner."""
+_BUT_CORNERS, _ROUNDED = 0.95, 0.01
+"""Quantile of a mean stroke's forces that counts as its largest, and share of a level by which that
+may exceed it: a spline overshoots at a corner."""
 
 _LEAST_PLATEAU = 0.05
 """Share of the peak speed over which a force has to stay at its level."""
@@ -180,7 +181,9 @@ def _level(strokes: Sequence[MeanStroke]) -> float:
     levels = [level for stroke in strokes if (level := _level_of(stroke)) is not None]
     if not levels:
         return math.inf
-    largest = max(float((-stroke.sign * stroke.force_n).max()) for stroke in strokes)
+    largest = max(
+        float(np.quantile(-stroke.sign * stroke.force_n, _BUT_CORNERS)) for stroke in strokes
+    )
     is_one = max(levels) - min(levels) <= _TOP_SHARE * abs(levels[0])
     return min(levels) if is_one and largest <= (1.0 + _ROUNDED) * max(levels) else math.inf
 

@@ -327,7 +327,7 @@ def _fit_spline(
     inverse: Array = np.linalg.inv(gram).astype(np.float64)
     if pieces >= _FOLLOWS_A_SINE:
         rows = _design(ANGLES, pieces)
-        if float(np.einsum("ij,jk,ik->i", rows, inverse, rows).max()) > _MOST_LEVERAGE:
+        if float(((rows @ inverse) * rows).sum(axis=1).max()) > _MOST_LEVERAGE:
             return None
     weights = inverse @ (design.T @ force_n)
     residual_n = force_n - design @ weights

@@ -378,7 +378,7 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
 
     def misfit(frequency_hz: float, count: int) -> float:
         made = _harmonics(t_s, frequency_hz, count)
-        residual_m = height_m - made @ np.linalg.lstsq(made, height_m, rcond=None)[0]
+        residual_m = height_m - made @ _fit_columns(made, height_m)
         return float(residual_m @ residual_m)
 
     best, count, chosen = np.inf, 1, coarse_hz
@@ -395,7 +395,7 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
         if value < best:
             best, count, chosen = value, tried, float(minimum.x)
     made = _harmonics(t_s, chosen, count)
-    weights = np.linalg.lstsq(made, height_m, rcond=None)[0]
+    weights = _fit_columns(made, height_m)
     fitted = made @ weights
     amplitude = 0.5 * float(np.ptp(fitted))
     if float(np.std(height_m - fitted)) > _SERIES_SHARE * amplitude:
@@ -416,6 +416,11 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
     )
     std = float(np.hypot(of_rates, of_frequency))
     return BlockMotion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
+
+
+def _fit_columns(made: Array, height_m: Array) -> Array:
+    """Weights of least squares; columns of a Fourier series over whole strokes are independent."""
+    return np.asarray(np.linalg.solve(made.T @ made, made.T @ height_m), np.float64)
 
 
 def _harmonics(t_s: Array, frequency_hz: float, count: int) -> Array:

@@ -405,7 +405,7 @@ def test_a_force_that_is_cut_off_is_said():
     said = characterise_record(
         ForceRecord("clipped", t_s, 0.3 + x_m, np.clip(force_n, -1e9, 250.0))
     ).quality
-    assert "force stays at its highest value 250" in " ".join(said)
+    assert "never leaves its highest level of 250 N" in " ".join(said)
     coarse = np.round(force_n / 20.0) * 20.0  # flat tops of a step are none
     assert "stays" not in " ".join(
         characterise_record(ForceRecord("coarse", t_s, 0.3 + x_m, coarse)).quality
