@@ -38,6 +38,9 @@ _MISFIT = 0.002
 """Share of the largest force of a step by which its odd part may differ from the equation."""
 
 
+_FEWEST_STEPS, _WIDEST = 3, 2.0
+"""Steps of different frequency that determine a lag, and ratio of the highest to the lowest."""
+
 _ITERATIONS, _CONVERGED = 8, 0.02
 """Most shifts by what is found, and share of its standard deviation below which no more is needed.
 """
@@ -67,12 +70,17 @@ class Lag(NamedTuple):
 
 
 def estimate_lag(steps: Sequence[DynoStep]) -> Lag | None:
-    """What a record's force lags its height by; None where no step has a speed that changes."""
-    strokes = [
-        [it for it in step.strokes if not (it.is_clipped or it.is_constant)] for step in steps
-    ]
-    strokes = [both for both in strokes if both]
-    if not strokes:
+    """What a record's force lags its height by; None with too few steps or frequencies.
+
+    A step alone does not tell a lag from a force with memory, such as that of a friction damper.
+    """
+    used = {
+        step.peak_speed_m_per_s / step.amplitude_m: both
+        for step in steps
+        if (both := [it for it in step.strokes if not (it.is_clipped or it.is_constant)])
+    }
+    strokes = list(used.values())
+    if len(used) < _FEWEST_STEPS or max(used) < _WIDEST * min(used):
         return None
     fit = _fit(strokes, 0.0)
     for _ in range(_ITERATIONS):
@@ -80,7 +88,7 @@ def estimate_lag(steps: Sequence[DynoStep]) -> Lag | None:
             break
         fit = _fit(strokes, fit.lag_s + fit.more_s)
     half = student_factor(fit.freedom) * fit.std_s
-    text = f"hysteresis at equal speeds, {len(strokes)} step{'s' if len(strokes) > 1 else ''}"
+    text = f"hysteresis at equal speeds, {len(strokes)} steps"
     figure = Figure(fit.lag_s, fit.lag_s - half, fit.lag_s + half, text)
     return Lag(figure, _agree(fit))
 
@@ -137,8 +145,6 @@ def _solve(design: Array, target: Array) -> tuple[Array, float, Array]:
 def _agree(fit: _LagFit) -> bool:
     """Whether one lag for all steps explains as much as one for each, or nearly."""
     by_step, count = fit.by_step, len(fit.by_step)
-    if count == 1:
-        return True
     parts: list[Array] = []
     for number, rows in enumerate(by_step):
         for row in rows:

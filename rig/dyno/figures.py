@@ -7,6 +7,7 @@ positive in compression and negative in rebound. What a figure is:
     window                    its mean over the tenth of the stroke to either side of the middle
     zero crossing             its value at mid-stroke
     peak                      its largest magnitude against the motion
+    peak of the cycles        the largest mean over all strokes by phase, of samples as measured
     energy per cycle          what the loop of force over height encloses
     equivalent damping        the linear damping that takes the same energy from the same motion
     spring rate               fall of the mean of both strokes per height: gas, springs, and what of
@@ -108,6 +109,7 @@ class Side(NamedTuple):
     force_window_n: Figure
     force_zero_crossing_n: Figure
     peak_force_n: Figure
+    peak_of_cycles_n: Figure
     hysteresis_n: Mapping[str, Figure]
 
 
@@ -281,6 +283,7 @@ def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float
         ),
         stroke.figure(stroke.row(0.0)[0], "zero crossing of the height"),
         stroke.figure(unit[against], "largest force of the mean stroke"),
+        stroke.peak_of_cycles(),
         {f"{share:g}": _hysteresis(stroke, down, up, share * peak) for share in _SPEEDS},
     )
 

@@ -102,8 +102,27 @@ ANGLES: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _GRID)
 cent of its force."""
 
 
+_PARTS = (9, 90)
+"""Fewest and most parts of a stroke over which samples are averaged stroke by stroke, two samples
+each: 20 to 2 degrees."""
+
 FINE: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 361)
 """Angles at which samples are gathered, half a degree apart."""
+
+
+class CycleMeans(NamedTuple):
+    """Means of samples over strokes by phase, as they were measured.
+
+    Attributes:
+        mean_n: Mean over the strokes of each part, NaN where few have a sample, shape (P,).
+        half_n: Half the 95 % interval by what the strokes differ by, infinite of a single one,
+            shape (P,).
+        angle: Middle of each part, shape (P,).
+    """
+
+    mean_n: Array
+    half_n: Array
+    angle: Array
 
 
 class MeanStroke(NamedTuple):
@@ -122,6 +141,7 @@ class MeanStroke(NamedTuple):
         noise_n: Standard deviation of a sample about the mean stroke.
         beyond: At `ANGLES` 1 where the true force lies above a clipped one, -1 where it lies below,
             else 0, shape (181,).
+        cycles: Means over the strokes by phase.
     """
 
     sign: int
@@ -135,6 +155,7 @@ class MeanStroke(NamedTuple):
     sums_n: Array
     noise_n: float
     beyond: NDArray[np.int8]
+    cycles: CycleMeans
 
     @property
     def height_m(self) -> Array:
@@ -173,6 +194,19 @@ class MeanStroke(NamedTuple):
         rows[np.arange(len(position)), before] = 1.0 - share
         rows[np.arange(len(position)), before + 1] = share
         return rows
+
+    def peak_of_cycles(self) -> Figure:
+        """The largest mean by phase against the motion, with what the strokes differ by there."""
+        mean_n = self.cycles.mean_n
+        at = int(np.argmax(np.where(np.isnan(mean_n), -math.inf, -self.sign * mean_n)))
+        value, half = float(mean_n[at]), float(self.cycles.half_n[at])
+        beyond = int(self.beyond[int(np.argmin(np.abs(ANGLES - self.cycles.angle[at])))])
+        low = -math.inf if beyond < 0 else value - half
+        high = math.inf if beyond > 0 else value + half
+        width = 180.0 / len(mean_n)
+        return Figure(
+            value, low, high, f"largest mean of all strokes by phase, {width:.0f} degrees"
+        )
 
     def figure(self, row: Array, method: str) -> Figure:
         """A linear functional of the force, with its interval."""
@@ -263,7 +297,32 @@ def mean_stroke(
         sums,
         float(np.sqrt(noise)),
         np.zeros(_GRID, np.int8),
+        _cycle_means(theta, force_n, number),
     )
+
+
+def _cycle_means(theta: Array, force_n: Array, number: NDArray[np.int64]) -> CycleMeans:
+    """Means by phase of forces at angles, and of the strokes that they belong to, shape (N,)."""
+    strokes, index = np.unique(number, return_inverse=True)
+    parts = int(np.clip(len(theta) / len(strokes) / 2.0, *_PARTS))
+    part = np.clip(((theta / np.pi + 0.5) * parts).astype(np.int64), 0, parts - 1)
+    cell = index * parts + part
+    shape, size = (len(strokes), parts), len(strokes) * parts
+    counts = np.bincount(cell, minlength=size).reshape(shape)
+    sums = np.bincount(cell, weights=force_n, minlength=size).reshape(shape)
+    has = counts > 0
+    means = np.where(has, sums / np.maximum(counts, 1), 0.0)
+    # The first and the last stroke may be parts of one.
+    have = has.sum(axis=0)
+    is_known = have >= max(1, len(strokes) - 2)
+    mean_n = np.where(is_known, means.sum(axis=0) / np.maximum(have, 1), math.nan)
+    apart_n = np.where(has, means - mean_n, 0.0)
+    freedom = np.maximum(have - 1, 1)
+    std_n = np.sqrt((apart_n**2).sum(axis=0) / freedom / np.maximum(have, 1))
+    factors = np.array([student_factor(float(n)) for n in range(1, len(strokes) + 1)])
+    half_n = np.where(have > 1, factors[freedom - 1] * std_n, math.inf)
+    middle = (np.arange(parts) + 0.5) / parts * np.pi - 0.5 * np.pi
+    return CycleMeans(*(np.asarray(values, np.float64) for values in (mean_n, half_n, middle)))
 
 
 def _mean_velocity(theta: Array, velocity_m_per_s: Array) -> Array:
