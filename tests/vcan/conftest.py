@@ -185,8 +185,12 @@ def bridge(files: Files, tmp_path: Path) -> Callable[..., Ended]:
         progress: Progress = lambda _t_ns, _mode: None,
         stop: Callable[[], bool] = lambda: False,
         listen_only: bool = False,
+        safe_after_s: float | None = None,
     ) -> Ended:
         ready: Plan = load_plan(files.bridge(channel), duration_s=seconds)
+        if safe_after_s is not None:
+            supervision = ready.config.supervision.model_copy(update={"safe_after_s": safe_after_s})
+            ready = ready.with_config(ready.config.model_copy(update={"supervision": supervision}))
         return live(
             ready,
             tmp_path / "run",
