@@ -1,16 +1,19 @@
 """The figures of a damper over all steps: peak curve, gas, friction, knee, temperature."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rig.dyno.figures import SIDES, DynoStep
-from rig.dyno.knee import find_knee
+from rig.dyno.knee import Knee, find_knee
 from rig.dyno.stroke_force import ANGLES, Figure, student_factor
 
 _ALIKE_SPEED = 0.05
 """Relative difference of speed and amplitude up to which steps are repetitions of each other."""
+
+_SLOW_M_PER_S = 0.06
+"""Speed of a step up to which the damping from no speed on may be a straight line."""
 
 _LEAST_WARMING_K = 2.0
 """Least span of temperatures for a change per kelvin: sensors agree within one kelvin."""
@@ -31,9 +34,9 @@ class Damper(NamedTuple):
     """Figures over all steps; None where the test does not determine them.
 
     Attributes:
-        gas_force_n: At mid-stroke of the slowest step.
+        gas_force_n: At mid-stroke, as the slowest step has it without its damping.
         gas_rate_n_per_m: Its rise per compression there.
-        friction_n: Half the difference of both directions there.
+        friction_n: Half the difference of both directions there, without damping.
         knee_m_per_s: By direction the speed at which the curve bends.
         slopes_n_s_per_m: By direction with a knee the slopes below and above it.
         asymmetry: Rebound over compression at peak velocity of the fastest step, without gas.
@@ -66,29 +69,7 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper from its steps, in time; one at least."""
     notes: list[str] = []
     slow = [step for step in steps if step.kind == "quasi_static"]
-    gas_force = gas_rate = friction = None
-    if slow:
-        slowest = min(slow, key=lambda step: step.peak_speed_m_per_s)
-        speed = 1e3 * slowest.peak_speed_m_per_s
-        gas_force, gas_rate, friction = (
-            figure._replace(method=f"{figure.method}, at {speed:.2g} mm/s")
-            if figure.is_bounded
-            else None
-            for figure in (
-                slowest.mean_force_n,
-                slowest.spring_rate_n_per_m,
-                slowest.half_difference_n,
-            )
-        )
-        notes.append(
-            f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in them, "
-            "and their intervals are of the measurement alone"
-        )
-    else:
-        notes.append(
-            "no step of 5 mm/s or less: friction, gas force and its rate cannot be determined, and "
-            "asymmetry is that of whole forces"
-        )
+    slowest = min(slow, key=lambda step: step.peak_speed_m_per_s, default=None)
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
     usual = [step for step in steps if step.kind != "warm_up"] or steps
     spring = (
@@ -110,6 +91,21 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         is_single = len(usual) == 1 and any(stroke.is_constant for stroke in usual[0].strokes)
         why = "the test has a single speed" if is_single else "force over speed has no bend in it"
         notes.append(f"no knee: {why}")
+    gas_force = gas_rate = friction = None
+    if slowest is None:
+        notes.append(
+            "no step of 5 mm/s or less: friction, gas force and its rate cannot be determined, and "
+            "asymmetry is that of whole forces"
+        )
+    else:
+        slopes = _slopes_at_no_speed(slowest, usual, knee)
+        gas_force, gas_rate, friction = _at_no_speed(slowest, slopes)
+        if slopes is None:
+            speed = 1e3 * slowest.peak_speed_m_per_s
+            notes.append(
+                f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in "
+                "them, and their intervals are of the measurement alone"
+            )
     per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(SIDES)}
     if not any(per_kelvin.values()):
         notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
@@ -123,6 +119,69 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         per_kelvin,
         tuple(notes),
     )
+
+
+def _slopes_at_no_speed(
+    slowest: DynoStep, steps: Sequence[DynoStep], knee: Mapping[str, Knee | None]
+) -> tuple[Figure, Figure] | None:
+    """Damping of both directions where it begins, in N·s/m; None where the steps do not show it.
+
+    It is the slope below the knee, or else that from the slowest step to one that is slow as well.
+    """
+    found: list[Figure] = []
+    slow = min(
+        (step for step in steps if step.kind == "velocity_step"),
+        key=lambda step: step.peak_speed_m_per_s,
+        default=None,
+    )
+    for index, side in enumerate(SIDES):
+        bend = knee[side]
+        if bend is not None:
+            found.append(bend.below_n_s_per_m)
+        elif slow is not None and slow.peak_speed_m_per_s <= _SLOW_M_PER_S:
+            figures = [
+                (it.compression, it.rebound)[index].force_at_peak_velocity_n
+                for it in (slowest, slow)
+            ]
+            apart = slow.peak_speed_m_per_s - slowest.peak_speed_m_per_s
+            value = abs(figures[1].value - figures[0].value) / apart
+            half = 0.5 * sum(it.high - it.low for it in figures) / apart
+            found.append(Figure(value, value - half, value + half, "slope to the next step"))
+    is_known = len(found) == len(SIDES) and all(it.is_bounded for it in found)
+    return (found[0], found[1]) if is_known else None
+
+
+def _at_no_speed(
+    slowest: DynoStep, slopes: tuple[Figure, Figure] | None
+) -> tuple[Figure | None, Figure | None, Figure | None]:
+    """Gas force, its rate and friction of the slowest step, without what bleeds in it."""
+    speed = slowest.peak_speed_m_per_s
+    at = f", at {1e3 * speed:.2g} mm/s"
+    gas, rate, friction = (
+        figure._replace(method=f"{figure.method}{at}") if figure.is_bounded else None
+        for figure in (
+            slowest.mean_force_n,
+            slowest.spring_rate_n_per_m,
+            slowest.half_difference_n,
+        )
+    )
+    if slopes is None or gas is None or friction is None:
+        return gas, rate, friction
+    down, up = slopes
+    half = 0.25 * speed * (down.high - down.low + up.high - up.low)
+    return (
+        _less(gas, 0.5 * speed * (down.value - up.value), half),
+        rate,
+        _less(friction, 0.5 * speed * (down.value + up.value), half),
+    )
+
+
+def _less(figure: Figure, bleed_n: float, half_n: float) -> Figure:
+    """A figure without the damping at its speed, which is known but for some half width."""
+    value = figure.value - bleed_n
+    half = float(np.hypot(0.5 * (figure.high - figure.low), half_n))
+    method = f"{figure.method}, less {bleed_n:.2g} N of damping there"
+    return Figure(value, value - half, value + half, method)
 
 
 def spring_curve(step: DynoStep) -> np.polynomial.Polynomial:

@@ -29,8 +29,9 @@ with one degree of freedom)."""
 _QUANTILE = 3.84
 """Rise of the sum of squares at the ends of a 95 % interval."""
 
-_SHARES = np.geomspace(0.04, 0.985, 32)
-"""Speeds of a stroke, as shares of its largest."""
+_SHARES = np.geomspace(0.2, 0.985, 32)
+"""Speeds of a stroke, as shares of its largest: in the slower part of a fast stroke, just behind the
+turning point, friction reverses and the mean stroke is smoother than the force."""
 
 _SLOWEST_M_PER_S, _LEAST_SHARE = 5e-3, 0.5
 """Speed, or share of the largest one if that is slower, below which dry friction that builds up
