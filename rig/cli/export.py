@@ -86,7 +86,8 @@ def export_command(
     paths, differences_n = _export_run(source, kind or "", out, smoothed)
     written = [str(path) for path in paths]
     if as_json:
-        print_json({"written": written, "rms_from_smoothed_n": differences_n})
+        compared = {"rms_from_smoothed_n": differences_n} if smoothed else {}
+        print_json({"written": written, **compared})
     else:
         for name, rms_n in differences_n.items():
             print_text(
