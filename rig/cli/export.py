@@ -1,7 +1,7 @@
 """`rig export`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -9,6 +9,9 @@ from rich.console import Console
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_bar
 from rig.cli.terminal import JsonFlag, print_json, print_text
+
+if TYPE_CHECKING:
+    from rig.log.reader import RunFolder
 
 EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
@@ -80,23 +83,40 @@ def export_command(
         raise InputError("--bench and --strut: expected --fmu with them")
     from rig.log.checksums import find_damage, refuse_damage
 
-    written = [str(path) for path in _export_run(source, kind or "", out, smoothed)]
+    paths, differences_n = _export_run(source, kind or "", out, smoothed)
+    written = [str(path) for path in paths]
     if as_json:
-        print_json({"written": written})
+        compared = {"rms_from_smoothed_n": differences_n} if smoothed else {}
+        print_json({"written": written, **compared})
     else:
+        for name, rms_n in differences_n.items():
+            print_text(
+                f"{name}: the estimate of the run differs from the smoothed force by {rms_n:.3g} N "
+                "RMS while it is valid."
+            )
         print_text("\n".join(f"Written: {path}" for path in written))
     refuse_damage(source, find_damage(source))
 
 
-def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path]:
+def _export_run(
+    source: Path, kind: str, out: Path, smoothed: bool
+) -> tuple[list[Path], dict[str, float]]:
+    """What was written, and how far the estimates of the run are from its smoothed forces."""
     from rig.formats.export import export_run
 
     if not smoothed:
-        return export_run(source, kind, out)
-    from rig.formats.smoothed import read_with_smoothed_forces
+        return export_run(source, kind, out), {}
+    from rig.formats.smoothed import compare_published, read_with_smoothed_forces
 
-    with progress_bar() as bar:
-        return export_run(source, kind, out, lambda run: read_with_smoothed_forces(run, bar))
+    differences_n: dict[str, float] = {}
+
+    def read(folder: Path) -> "RunFolder":
+        with progress_bar() as bar:
+            run = read_with_smoothed_forces(folder, bar)
+        differences_n.update(compare_published(run))
+        return run
+
+    return export_run(source, kind, out, read), differences_n
 
 
 def _export_model(

@@ -4,6 +4,7 @@ import math
 import os
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -169,16 +170,21 @@ def init(
     ask = _ask_place if sys.stdin.isatty() else None
     signals = choose_signals(database, names, ask, is_dyno=is_dyno)
     proposal = Proposal(database, signals, BusConfig(interface, channel, bitrate), is_dyno)
-    mass_kg = _known(
-        mass_kg, "--mass-kg", "Mass that the strut carries, kg", 10.0 if is_dyno else None
-    )
+    if not sys.stdin.isatty():
+        _refuse_missing(
+            {
+                "--mass-kg": is_dyno or mass_kg is not None,
+                "--length-at-rest-m or --free-length-m": (length_at_rest_m, free_length_m)
+                != (None, None),
+                "--stiffness-n-per-m": is_measured or stiffness_n_per_m is not None,
+            }
+        )
+    mass_kg = _known(mass_kg, "Mass that the strut carries, kg", 10.0 if is_dyno else None)
     if length_at_rest_m is None and free_length_m is None:
         question = "Length of the strut at rest, by a rule, m (or give --free-length-m)"
-        length_at_rest_m = _known(None, "--length-at-rest-m", question, None)
+        length_at_rest_m = _known(None, question, None)
     if not is_measured:
-        stiffness_n_per_m = _known(
-            stiffness_n_per_m, "--stiffness-n-per-m", "Stiffness, roughly, N/m", None
-        )
+        stiffness_n_per_m = _known(stiffness_n_per_m, "Stiffness, roughly, N/m", None)
     model, source = _first_model(mass_kg, length_at_rest_m, stiffness_n_per_m, damping_n_s_per_m)
     # On a dyno no weight rests on the strut.
     free_length_m = free_length_m or (length_at_rest_m if is_dyno else None)
@@ -198,14 +204,19 @@ def init(
     _print(out, model_file, proposal, model, source)
 
 
-def _known(value: float | None, option: str, question: str, default: float | None) -> float:
+def _refuse_missing(given: Mapping[str, bool]) -> None:
+    """Refuse a call without a terminal in which options are missing: all of them at once."""
+    missing = [option for option, is_given in given.items() if not is_given]
+    if missing:
+        raise InputError(f"{', '.join(missing)}: required, or answer in a terminal")
+
+
+def _known(value: float | None, question: str, default: float | None) -> float:
     """A number that an option gave, or that is asked for in a terminal."""
     if value is not None:
         return value
     if default is not None:
         return default
-    if not sys.stdin.isatty():
-        raise InputError(f"{option}: required: {question}")
     answer = float(typer.prompt(question, type=float))
     if not 0.0 < answer < 1e9:
         raise InputError(f"{question}: {answer:g}, expected a positive number")

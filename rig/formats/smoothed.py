@@ -75,6 +75,26 @@ def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
     return replace(run, steps=steps)
 
 
+def compare_published(run: RunFolder) -> dict[str, float]:
+    """RMS difference of each strut's estimate from its smoothed force over the valid ticks, in N.
+
+    The run is one with smoothed forces; NaN where no tick has both.
+    """
+    differences: dict[str, float] = {}
+    for column in run.steps.schema.names:
+        name = column.removesuffix(".smoothed_force_n")
+        if name == column:
+            continue
+        force_n, smoothed_n, valid = (
+            np.asarray(run.steps.column(f"{name}.{key}").to_numpy(), np.float64)
+            for key in ("force_n", "smoothed_force_n", "valid")
+        )
+        apart_n = (force_n - smoothed_n)[valid == 1.0]
+        apart_n = apart_n[np.isfinite(apart_n)]
+        differences[name] = float(np.sqrt(np.mean(apart_n**2))) if len(apart_n) else math.nan
+    return differences
+
+
 def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, tuple[Array, Array]]:
     """Force of each strut at each tick, and its standard deviation, by the strut's name.
 

@@ -485,30 +485,35 @@ def _propose_publish(database: Database, signals: Signals) -> list[str]:
     estimates = [item for item in rank_signals(free, signal_ranking.ESTIMATE) if item.is_likely]
     if not estimates:
         forces = [
-            f"{item.name} ({signal.name})"
+            (item, signal)
             for item in free
             for signal in item.signals.values()
             if item.sender != bench and measures(signal, Dimension.FORCE)
         ]
-        return [*_hint_at_messages(forces), *_lines_of_own_message(database)]
+        return [*_hint_at_messages(forces, free), *_lines_of_own_message(database)]
     best = estimates[0]
-    lines = ["publish:", _publish_line(FORCE.key, best, estimates)]
+    line = _publish_line(FORCE.key, best, estimates)
+    return _lines_of_estimate(best.message, line, free)
+
+
+def _lines_of_estimate(message: Message, force: str, free: Sequence[Message]) -> list[str]:
+    """Lines that publish the estimate in a message: force, validity, counter, and the mode."""
+    lines = ["publish:", force]
     # Validity and mode may have another message, but never one that another node sends.
-    sender = best.message.sender
-    near = [best.message, *(it for it in free if it is not best.message and it.sender == sender)]
+    near = [message, *(it for it in free if it is not message and it.sender == message.sender)]
     valid = _find_integer(near, _states_validity, lambda bits: bits >= 1)
     lines += (
         [f"  {VALID.key}: {{message: {valid[0].name}, signal: {valid[1].name}}}"]
         if valid
         else [
-            *_hint_at_bits(best.message),
+            *_hint_at_bits(message),
             "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
             "  # unsafe: {publish_without_valid: true} accepts that",
         ]
     )
-    if best.message.protection is None:
+    if message.protection is None:
         counter = _find_integer(
-            [best.message],
+            [message],
             lambda signal: _has_word(signal, _COUNTER_WORDS) or _counts(signal),
             lambda bits: bits > 1,
         )
@@ -540,13 +545,19 @@ def _or_others(names: Sequence[str]) -> str:
     return f"; or {', '.join(names[1:])}" if names[1:] else ""
 
 
-def _hint_at_messages(forces: Sequence[str]) -> list[str]:
-    """A comment that names messages which may carry the estimate."""
+def _hint_at_messages(
+    forces: Sequence[tuple[Message, Signal]], free: Sequence[Message]
+) -> list[str]:
+    """A comment that names messages which may carry the estimate, with the lines of the first."""
     if not forces:
         return []
+    names = [f"{message.name} ({signal.name})" for message, signal in forces[:_MOST_OTHERS]]
+    message, signal = forces[0]
+    force = f"  {FORCE.key}: {{message: {message.name}, signal: {signal.name}}}"
     return [
         "# A force in a message that the sender of the height does not send may be meant for the",
-        f"# estimate: {', '.join(forces[:_MOST_OTHERS])}. If so, use it below.",
+        f"# estimate: {', '.join(names)}. If so, remove the # before these lines:",
+        *(f"# {line}" for line in _lines_of_estimate(message, force, free)),
     ]
 
 
@@ -556,10 +567,10 @@ def _lines_of_own_message(database: Database) -> list[str]:
     free = (number for number in range(_FIRST_OWN_ID, _LAST_OWN_ID) if number not in used)
     own = next(free, _FIRST_OWN_ID)
     return [
-        "# No message of the DBC looks like one for the estimate, so it is not published. To",
-        "# publish it, add these three lines to the DBC, after its last message (BO_), with an",
-        f"# identifier that is free on your bus (here {own:#x}, that is {own}), and remove",
-        "# the # before publish and the two lines below it:",
+        "# No message of the DBC is surely one for the estimate, so it is not published. To",
+        "# publish it in one of your own, add these three lines to the DBC, after its last",
+        "# message (BO_), with an identifier that is free on your bus (here",
+        f"# {own:#x}, that is {own}), and remove the # before publish and the two lines below it:",
         f"# BO_ {own} RIG_ESTIMATE: 5 Vector__XXX",
         '#  SG_ FORCE : 0|32@1- (0.001,0) [-2000000|2000000] "N" Vector__XXX',
         '#  SG_ VALID : 32|1@1+ (1,0) [0|1] "" Vector__XXX',

@@ -29,6 +29,10 @@ _LAGS = 100
 """Lengths that are tried, spread evenly by their logarithm."""
 
 
+_ENOUGH_S = 3.0
+"""Length of a part that holds three periods of 1 Hz."""
+
+
 class Gaps(NamedTuple):
     """Gaps of two samples or more in the applied force.
 
@@ -63,8 +67,9 @@ class Gaps(NamedTuple):
         return (
             f"{text}. In {long} of them it changes too much to be interpolated (longer than "
             f"{self.longest_interpolated_s:.2g} s): a diagnosis divides the run there, into parts "
-            f"of {mean_s:.2g} s on average. If these do not hold several periods of the motion "
-            "each, record it again, with less load on the computer and the bus."
+            f"of {mean_s:.2g} s on average, of each of which two initial states are fitted. Parts "
+            f"of {_ENOUGH_S:g} s are enough for motions faster than 1 Hz; for shorter ones record "
+            "it again, with less load on the computer and the bus."
         )
 
     def as_dict(self) -> dict[str, object]:

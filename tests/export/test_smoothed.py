@@ -14,7 +14,7 @@ from can_dbc.errors import InputError
 from rig.bridge.values import Mode
 from rig.cli.main import main
 from rig.formats import smoothed
-from rig.formats.smoothed import read_with_smoothed_forces
+from rig.formats.smoothed import compare_published, read_with_smoothed_forces
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan, plan_of_run
@@ -234,3 +234,14 @@ def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, ca
     found, ready = read_run(run), plan_of_run(run)
     with pytest.raises(InputError, match="straight guides"):
         smoothed.smooth_forces(found, replace(ready, model=pitching), lambda _what, _share: None)
+
+
+def test_the_estimate_is_compared_with_the_smoothed_force_while_it_is_valid(reference):
+    folder, _ = reference
+    run = read_with_smoothed_forces(folder, lambda _what, _share: None)
+    valid = column(run.steps, "strut.valid") == 1.0
+    apart_n = column(run.steps, "strut.force_n") - column(run.steps, "strut.smoothed_force_n")
+    apart_n = apart_n[valid & np.isfinite(apart_n)]
+    assert len(apart_n) > 1000
+    expected_n = pytest.approx(np.sqrt(np.mean(apart_n**2)))
+    assert compare_published(run) == {"strut": expected_n}

@@ -137,7 +137,13 @@ def test_a_force_that_suits_both_places_is_mapped_to_the_one_that_is_named(rig, 
 def test_what_options_leave_open_is_named(rig, capsys):
     for number in range(0, len(FACTS), 2):
         assert rig(*FACTS[:number], *FACTS[number + 2 :], *NO_FORCE) == 2
-        assert f"{FACTS[number]}: required" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert FACTS[number] in said
+        assert ": required" in said
+    # All that is missing is named at once.
+    assert rig(*NO_FORCE) == 2
+    said = capsys.readouterr().err
+    assert all(option in said for option in FACTS[::2])
 
 
 def test_in_a_terminal_it_asks(rig, tmp_path, monkeypatch):

@@ -182,7 +182,7 @@ def test_a_message_that_is_not_for_an_estimate_is_left_and_one_of_its_own_is_sho
     own = "\n\n" + "\n".join(line.removeprefix("# ") for line in statements)
     dbc.write_text(used[:end] + own + used[end:])
     for line in text[first:].splitlines()[3:6]:
-        text = text.replace(line, line.removeprefix("# "))
+        text = text[:first] + text[first:].replace(line, line.removeprefix("# "))
     (tmp_path / "my.yaml").write_text(text)
     plan = load_plan(tmp_path / "my.yaml")
     assert not errors(plan)
@@ -295,7 +295,11 @@ def test_what_names_of_another_language_may_mean_is_left_to_the_user(dbc):
     text = propose(dbc)
     assert "add: valid: {signal: AFS_HgtGld, value: 1}; or AFS_LampAan" in text
     assert "add: counter: AFS_HgtTel" in text
-    assert "GST_Schatting (GST_PootKr). If so, use it below." in text
+    hint = text.index("GST_Schatting (GST_PootKr). If so, remove the # before these lines:")
+    lines = text[hint:].splitlines()[1:3]
+    assert yaml.safe_load("\n".join(line.removeprefix("# ") for line in lines)) == {
+        "publish": {"force": {"message": "GST_Schatting", "signal": "GST_PootKr"}}
+    }
     assert yaml.safe_load(text)["signals"]["height"] == {
         "message": "AFS_Hoogte",
         "signal": "AFS_Height",

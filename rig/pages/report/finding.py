@@ -190,6 +190,10 @@ def _meaning(result: Result, item: FoundEffect) -> str:
         [(middle, float(v)) for v in np.linspace(slow, fast, _POINTS)],
     ]
     force_at = _force_of(law, item, result)
+    if not any(force_at(*at) for points in ends for at in points):
+        # A damper that acts at an end of the travel only.
+        place_m = max((low_m, high_m), key=lambda height_m: abs(force_at(height_m, fast)))
+        ends[1] = [(place_m, speed) for _, speed in ends[1]]
     forces = [[force_at(*at) for at in points] for points in ends]
     if not all(math.isfinite(force) for of in forces for force in of):
         return ""
@@ -207,7 +211,10 @@ def _meaning(result: Result, item: FoundEffect) -> str:
         texts.append(
             f"{quantity(force[at], 'N')} at {with_unit(number(x, 2 - 2 * (unit == 'mm')), unit)}"
         )
+    place = points[0][0]
     where = "" if over_velocity else " of height"
+    if over_velocity and place != middle:
+        where = f", at {with_unit(number(1e3 * place, 0), 'mm')} of height"
     return f"{capital(_bare(law.words))}: {', '.join(texts)}{where}."
 
 

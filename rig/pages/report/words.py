@@ -221,8 +221,11 @@ def _not_explained(diagnosis: Diagnosis) -> str:
     corrected = diagnosis.effects or diagnosis.linear or diagnosis.existing
     if not (corrected and falls):
         return f"{start}: {name} is {before}{_or_else(diagnosis)}."
-    words = join_words([effect(item.name).words for item in diagnosis.effects], "and")
-    nearest = f"the best model found, with {words or 'linear corrections alone'}, takes"
+    parts = [effect(item.name).words for item in diagnosis.effects]
+    parts += ["linear corrections"] if diagnosis.linear and not parts else []
+    parts += ["other parameters of its own effects"] if diagnosis.existing else []
+    only = "" if diagnosis.effects else " alone"
+    nearest = f"the best model found, with {join_words(parts, 'and')}{only}, takes"
     if diagnosis.effects and diagnosis.effects[0].family == "restoring_surface":
         nearest = (
             "a table of force over height and velocity, which names no cause, is offered and takes"
