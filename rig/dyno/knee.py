@@ -29,9 +29,13 @@ with one degree of freedom)."""
 _QUANTILE = 3.84
 """Rise of the sum of squares at the ends of a 95 % interval."""
 
-_SHARES = np.geomspace(0.2, 0.985, 32)
-"""Speeds of a stroke, as shares of its largest: in the slower part of a fast stroke, just behind the
-turning point, friction reverses and the mean stroke is smoother than the force."""
+_POINTS, _SLOWEST_SHARE, _FASTEST_SHARE = 32, 0.1, 0.985
+"""Speeds at which a stroke is used, and shares of its largest between which they lie. In the slower
+part of a fast stroke, just behind the turning point, friction reverses and the mean stroke is
+smoother than the force."""
+
+_SAMPLES = 4.0
+"""Samples from the turning point on within which no speed is used, for the same reason."""
 
 _SLOWEST_M_PER_S, _LEAST_SHARE = 5e-3, 0.5
 """Speed, or share of the largest one if that is slower, below which dry friction that builds up
@@ -137,7 +141,10 @@ def _points(stroke: MeanStroke, spring: Callable[[Array], Array]) -> tuple[Array
         at, rows = np.array([float(speed[len(speed) // 2])]), stroke.row(0.0)
     else:
         peak = float(speed[top])
-        at = _SHARES * peak
+        # The cycles' means are of two samples each where these are few.
+        angle = min(_SAMPLES / 2.0 * np.pi / len(stroke.cycles.angle), 0.25 * np.pi)
+        least = max(_SLOWEST_SHARE, float(np.sin(angle)))
+        at = np.geomspace(least, _FASTEST_SHARE, _POINTS) * peak
         at = at[at >= min(_SLOWEST_M_PER_S, _LEAST_SHARE * peak)]
         rows = np.array(
             [

@@ -93,10 +93,9 @@ def test_a_whole_test_is_divided_into_its_parts(tested):
 
 def test_friction_and_gas_are_those_of_the_slow_cycle(tested):
     damper = tested.damper
-    speed, warm = 0.00151, 1.0 + PER_KELVIN * (tested.steps[1].temperature_c - 25.0)
-    bleed = 2600.0 * speed * warm
-    assert damper.friction_n.low <= FRICTION_N + 1.2 * bleed <= damper.friction_n.high
-    assert damper.gas_force_n.low <= GAS_N - 0.2 * bleed <= damper.gas_force_n.high
+    # At 1.5 mm/s the valves damp with 3 to 5 N, which are not friction.
+    assert damper.friction_n.low <= FRICTION_N <= damper.friction_n.high
+    assert damper.gas_force_n.low <= GAS_N <= damper.gas_force_n.high
     assert damper.gas_rate_n_per_m.low <= RATE <= damper.gas_rate_n_per_m.high
     assert damper.friction_n.high - damper.friction_n.low < 4.0
 
