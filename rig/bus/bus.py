@@ -325,7 +325,6 @@ _DRIVERS = {
     "vector": ": expected Vector's XL driver library to be installed",
     "kvaser": ": expected Kvaser's CANlib to be installed",
     "ixxat": ": expected the VCI driver of HMS to be installed",
-    "udp_multicast": ": expected the package msgpack (`pip install 'python-can[multicast]'`)",
 }
 """What interfaces need that is not part of python-can."""
 
@@ -333,11 +332,8 @@ _DRIVERS = {
 def _cure(config: BusConfig, error: Exception) -> str:
     """What to do about an interface that cannot be opened; empty where that is not known.
 
-    With SocketCAN, python-can raises what the kernel reports, an `OSError`. UDP multicast fails
-    without its package, or for an address, of which the kernel's message says enough.
+    With SocketCAN, python-can raises what the kernel reports, an `OSError`.
     """
-    if config.interface == "udp_multicast" and "msgpack" not in str(error):
-        return ""
     if config.interface != "socketcan":
         return _DRIVERS.get(config.interface, "")
     name = config.channel

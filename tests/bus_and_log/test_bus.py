@@ -108,21 +108,6 @@ def test_a_kernels_refusal_names_its_cure(monkeypatch, number, cure):
         Bus(BusConfig("socketcan", "can7", 500_000))
 
 
-def test_udp_multicast_without_its_package_names_the_remedy(monkeypatch):
-    monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)
-    with pytest.raises(BusError, match=r"msgpack.*pip install 'python-can\[multicast\]'"):
-        Bus(BusConfig("udp_multicast", "239.74.163.2", 500_000))
-
-
-def test_udp_multicast_without_a_network_names_no_package(monkeypatch):
-    def refuse(**_arguments):
-        raise OSError(errno.ENODEV, "os error")
-
-    monkeypatch.setattr(can, "Bus", refuse)
-    with pytest.raises(BusError, match=r"cannot be opened: .*os error$"):
-        Bus(BusConfig("udp_multicast", "239.74.163.2", 500_000))
-
-
 def test_a_closed_bus_is_an_error_of_the_bus(config):
     bus = Bus(config)
     bus.close()
