@@ -18,6 +18,8 @@ from scipy.special import ndtr  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
+from rig.dyno.conditions import Conditions, apart_k, find_conditions, slowest
+from rig.dyno.damper import FRICTION, GAS, GAS_RATE
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure, student_factor
 
@@ -67,12 +69,15 @@ class Trend(NamedTuple):
 def compare_dampers(before: Characteristics, after: Characteristics) -> list[Difference]:
     """Differences of two states, significant ones first.
 
+    The figures of the second one are brought to the temperature and the zero of the first one.
+
     Raises:
         InputError: They have no figure in common.
     """
+    conditions = find_conditions(before, after)
     differences = [
         Difference(name, unit, first, second, _difference(second, first), differs=False)
-        for name, (unit, (first, second)) in _common_figures([before, after]).items()
+        for name, (unit, (first, second)) in _common_figures([before, after], conditions).items()
     ]
     differs = _holm_procedure([item.change for item in differences])
     marked = [
@@ -126,11 +131,11 @@ def _relative_difference(step: DynoStep, reference: DynoStep) -> float:
 
 
 def list_not_comparable(items: Sequence[Characteristics]) -> list[str]:
-    """Steps without a partner of their speed and amplitude, and clipped forces, in words."""
+    """What of several records is not compared, and why, in words."""
+    reference = items[0]
     return [
         *(
-            f"{item.name}, ±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s: "
-            f"no such step in {other.name}"
+            f"{item.name}, {_step_words(step)}: no such step in {other.name}"
             for item in items
             for other in items
             if other is not item
@@ -144,7 +149,38 @@ def list_not_comparable(items: Sequence[Characteristics]) -> list[str]:
             for side, stroke in zip(SIDES, step.strokes, strict=True)
             if stroke.is_clipped
         ),
+        *(text for item in items[1:] for text in _unlike_conditions(reference, item)),
     ]
+
+
+def _step_words(step: DynoStep) -> str:
+    return f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
+
+
+def _unlike_conditions(before: Characteristics, after: Characteristics) -> list[str]:
+    """Figures that temperature or the zero of the load cell leave open."""
+    conditions = find_conditions(before, after)
+    texts: list[str] = []
+    for first, second in pair_steps(before, after):
+        warmer_k = apart_k(first, second)
+        if second is None or conditions.energy(first.energy_per_cycle_j, warmer_k) is not None:
+            continue
+        texts.append(
+            f"{after.name}, {_step_words(second)}: {warmer_k:+.1f} K from {before.name}, and "
+            "neither record determines the change per kelvin"
+        )
+    shift = conditions.shift
+    if shift is not None and conditions.cause in ("zero", "open"):
+        known = (
+            "with an unchanged spring rate: the zero of the load cell, or a preload"
+            if conditions.cause == "zero"
+            else "and the spring rate does not tell gas from the zero of the load cell"
+        )
+        texts.append(
+            f"{after.name}, gas force: all forces are shifted by {shift.value:+.3g} N, {known}. "
+            "The other figures are compared without this shift"
+        )
+    return texts
 
 
 def _fit_trend(name: str, unit: str, doses: "np.ndarray", figures: Sequence[Figure]) -> Trend:
@@ -163,9 +199,16 @@ def _fit_trend(name: str, unit: str, doses: "np.ndarray", figures: Sequence[Figu
     return Trend(name, unit, figure, at_zero, differs=False, is_straight=misfit < _MISFIT)
 
 
-def _common_figures(items: Sequence[Characteristics]) -> dict[str, tuple[str, list[Figure]]]:
-    """Figures that all states have: by name the unit, and the figure of each state."""
-    first, *others = [_figures_by_name(item, items[0]) for item in items]
+def _common_figures(
+    items: Sequence[Characteristics], conditions: Conditions | None = None
+) -> dict[str, tuple[str, list[Figure]]]:
+    """Figures that all states have: by name the unit, and the figure of each state.
+
+    With conditions, they are those of the first state in all of them.
+    """
+    reference, *rest = items
+    first = _figures_by_name(reference, reference, None)
+    others = [_figures_by_name(item, reference, conditions) for item in rest]
     common = {
         name: (unit, [figure, *(other[name][1] for other in others)])
         for name, (unit, figure) in first.items()
@@ -181,26 +224,57 @@ def _common_figures(items: Sequence[Characteristics]) -> dict[str, tuple[str, li
 
 
 def _figures_by_name(
-    item: Characteristics, reference: Characteristics
+    item: Characteristics, reference: Characteristics, conditions: Conditions | None
 ) -> Mapping[str, tuple[str, Figure]]:
     """Figures by name; steps are called by their speed in the first record."""
-    figures: dict[str, tuple[str, Figure | None]] = {**item.damper.properties()}
+    figures: dict[str, tuple[str, Figure | None]] = _of_damper(item, reference, conditions)
     for sought, step in pair_steps(reference, item):
         if step is None:
             continue
         at = f"at {sought.peak_speed_m_per_s:.3g} m/s"
+        down, up = (side.force_at_peak_velocity_n for side in (step.compression, step.rebound))
+        energy: Figure | None = step.energy_per_cycle_j
+        rate, hysteresis = step.spring_rate_n_per_m, step.hysteresis_at_zero_n
+        if conditions is not None:
+            warmer_k = apart_k(sought, step)
+            down, up = (
+                conditions.force(figure, side, warmer_k) for side, figure in enumerate((down, up))
+            )
+            energy = conditions.energy(energy, warmer_k)
+            rate = conditions.gas(rate, warmer_k)
+            hysteresis = conditions.friction(hysteresis, warmer_k)
         figures |= {
-            f"compression force {at}": ("N", step.compression.force_at_peak_velocity_n),
-            f"rebound force {at}": ("N", step.rebound.force_at_peak_velocity_n),
-            f"energy per cycle {at}": ("J", step.energy_per_cycle_j),
-            f"spring rate {at}": ("N/m", step.spring_rate_n_per_m),
-            f"hysteresis at the turning points {at}": ("N", step.hysteresis_at_zero_n),
+            f"compression force {at}": ("N", down),
+            f"rebound force {at}": ("N", up),
+            f"energy per cycle {at}": ("J", energy),
+            f"spring rate {at}": ("N/m", rate),
         }
+        if sought.kind == "quasi_static":
+            # Of a fast step it contains damping, which its interval does not.
+            figures[f"hysteresis at the turning points {at}"] = ("N", hysteresis)
     return {
         name: (unit, figure)
         for name, (unit, figure) in figures.items()
         if figure is not None and figure.is_bounded
     }
+
+
+def _of_damper(
+    item: Characteristics, reference: Characteristics, conditions: Conditions | None
+) -> dict[str, tuple[str, Figure | None]]:
+    """Figures over all steps by name."""
+    own: dict[str, tuple[str, Figure | None]] = {**item.damper.properties()}
+    if conditions is None:
+        return own
+    warmer_k = apart_k(slowest(reference), slowest(item))
+    wider = {GAS: conditions.gas, GAS_RATE: conditions.gas, FRICTION: conditions.friction}
+    figures = {
+        name: (unit, figure and wider.get(name, conditions.damping)(figure, warmer_k))
+        for name, (unit, figure) in own.items()
+    }
+    if conditions.cause in ("zero", "open"):
+        figures.pop(GAS, None)
+    return figures
 
 
 def _standard_deviation(figure: Figure) -> float:

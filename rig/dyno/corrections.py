@@ -117,16 +117,17 @@ class Corrections(NamedTuple):
 
 def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
     change = (
-        f"the force at rest at one height changed by {drift.largest.value:+.3g} N from "
-        f"{drift.begin_s:.1f} s to {drift.end_s:.1f} s"
+        f"the zero of the load cell drifted by {drift.largest.value:+.3g} N between "
+        f"{drift.begin_s:.1f} s and {drift.end_s:.1f} s, as {drift.source} show"
     )
     if removes:
-        return f"{change}, and the cycles between with it: the zero drifted, which is removed"
-    if drift.is_confirmed:
-        return f"{change}, and the cycles between with it: the zero drifted, which is not removed"
+        return f"{change}: removed"
+    if drift.is_known:
+        return f"{change}: not removed"
     return (
-        f"{change}: gas that warms, friction that holds another way, or a cell that drifts "
-        "(the cycles between do not decide it; nothing is removed)"
+        f"the force at rest at one height changed by {drift.largest.value:+.3g} N between "
+        f"{drift.begin_s:.1f} s and {drift.end_s:.1f} s: gas that warms, friction that holds "
+        "another way, or a cell that drifts (the cycles between do not show it; nothing is removed)"
     )
 
 
@@ -158,7 +159,7 @@ def decide(
         lag_s = wanted.lag_s
     elif wanted.lag and lag is not None and _is_known(lag):
         lag_s = lag.figure.value
-    removes = wanted.zero and drift is not None and drift.is_confirmed
+    removes = wanted.zero and drift is not None and drift.is_known
     return Corrections(drift, removes, lag, lag_s)
 
 

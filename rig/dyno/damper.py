@@ -30,6 +30,10 @@ _FEWEST_STROKES = 6
 """Fewest strokes for a change per kelvin."""
 
 
+GAS, GAS_RATE, FRICTION = "gas force", "gas spring rate", "friction"
+"""Names of properties of a damper."""
+
+
 class Damper(NamedTuple):
     """Figures over all steps; None where the test does not determine them.
 
@@ -41,6 +45,7 @@ class Damper(NamedTuple):
         slopes_n_s_per_m: By direction with a knee the slopes below and above it.
         asymmetry: Rebound over compression at peak velocity of the fastest step, without gas.
         force_per_kelvin_n_per_k: By direction the change of force per kelvin.
+        share_per_kelvin_per_k: By direction the same over the force without gas.
         notes: Why a figure is missing, and what was assumed.
     """
 
@@ -51,14 +56,15 @@ class Damper(NamedTuple):
     slopes_n_s_per_m: dict[str, tuple[Figure, Figure]]
     asymmetry: Figure | None
     force_per_kelvin_n_per_k: dict[str, Figure | None]
+    share_per_kelvin_per_k: dict[str, Figure | None]
     notes: tuple[str, ...]
 
     def properties(self) -> dict[str, tuple[str, Figure]]:
         """Unit and figure of each property of the damper that the test determines, by name."""
         named = {
-            "gas force": ("N", self.gas_force_n),
-            "gas spring rate": ("N/m", self.gas_rate_n_per_m),
-            "friction": ("N", self.friction_n),
+            GAS: ("N", self.gas_force_n),
+            GAS_RATE: ("N/m", self.gas_rate_n_per_m),
+            FRICTION: ("N", self.friction_n),
             **{f"knee, {side}": ("m/s", figure) for side, figure in self.knee_m_per_s.items()},
             "rebound over compression": ("", self.asymmetry),
         }
@@ -106,8 +112,8 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
                 f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in "
                 "them, and their intervals are of the measurement alone"
             )
-    per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(SIDES)}
-    if not any(per_kelvin.values()):
+    warming = {name: _per_kelvin(steps, index) for index, name in enumerate(SIDES)}
+    if not any(warming.values()):
         notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
     return Damper(
         gas_force,
@@ -116,7 +122,11 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         {name: None if it is None else it.speed_m_per_s for name, it in knee.items()},
         {name: (it.below_n_s_per_m, it.above_n_s_per_m) for name, it in knee.items() if it},
         _asymmetry(fastest, gas_force),
-        per_kelvin,
+        {name: None if it is None else it.slope for name, it in warming.items()},
+        {
+            name: None if it is None or gas_force is None else it.share(gas_force)
+            for name, it in warming.items()
+        },
         tuple(notes),
     )
 
@@ -234,7 +244,20 @@ def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     return Figure(ratio, ratio - half, ratio + half, f"{of} at peak velocity, fastest step")
 
 
-def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
+class _Warming(NamedTuple):
+    """Change of a force per kelvin, and the mean of the forces that it is of."""
+
+    slope: Figure
+    mean_n: float
+
+    def share(self, gas: Figure) -> Figure:
+        """The change over the force without gas."""
+        damping_n = self.mean_n - gas.value
+        low, high = sorted((self.slope.low / damping_n, self.slope.high / damping_n))
+        return Figure(self.slope.value / damping_n, low, high, self.slope.method)
+
+
+def _per_kelvin(steps: Sequence[DynoStep], index: int) -> _Warming | None:
     """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
     if any(step.temperature_c is None for step in steps):
         return None
@@ -245,8 +268,8 @@ def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
             groups.append([step])
         else:
             alike.append(step)
-    slopes = [slope for group in groups if (slope := _slope(group, index)) is not None]
-    return min(slopes, key=lambda slope: slope.high - slope.low, default=None)
+    found = [slope for group in groups if (slope := _slope(group, index)) is not None]
+    return min(found, key=lambda it: it.slope.high - it.slope.low, default=None)
 
 
 def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
@@ -256,7 +279,7 @@ def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
     )
 
 
-def _slope(group: Sequence[DynoStep], index: int) -> Figure | None:
+def _slope(group: Sequence[DynoStep], index: int) -> _Warming | None:
     """Least squares through the strokes of like steps."""
     temperatures = np.concatenate([step.warmth[index][0] for step in group])
     forces = np.concatenate([step.warmth[index][1] for step in group])
@@ -270,4 +293,5 @@ def _slope(group: Sequence[DynoStep], index: int) -> Figure | None:
     half = student_factor(freedom) * std
     speed = group[0].peak_speed_m_per_s
     text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
-    return Figure(slope, slope - half, slope + half, text)
+    figure = Figure(slope, slope - half, slope + half, text)
+    return _Warming(figure, float(forces.mean()))

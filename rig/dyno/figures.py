@@ -182,7 +182,9 @@ def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoS
     )
     warm_c = None if warm_c is None else _thinned(warm_c[block.begin : block.end], share)
     motion = fit_motion(times_s, heights_m, round(2.0 * block.cycles))
-    if np.isnan(motion.period_s) and not is_repetition(t_s, record.height_m, block):
+    if motion is None or (
+        np.isnan(motion.period_s) and not is_repetition(t_s, record.height_m, block)
+    ):
         return f"{len(block.strokes)} strokes of one amplitude that do not repeat one motion"
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.

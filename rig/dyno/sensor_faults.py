@@ -22,7 +22,7 @@ from scipy.ndimage import median_filter  # pyright: ignore[reportUnknownVariable
 
 from can_dbc.errors import InputError
 from rig.dyno.figures import ForceRecord
-from rig.dyno.stroke_force import ForceRange, MeanStroke
+from rig.dyno.stroke_force import ANGLES, FINE, ForceRange, MeanStroke
 from rig.dyno.strokes import Array
 from rig.recordings.clipping import find_sudden_plateaus
 from rig.recordings.stretches import find_stretches
@@ -36,8 +36,8 @@ _LARGEST_STROKE_M = 5.0
 _WINDOW = 7
 """Samples of the running median: a spike of three is its minority."""
 
-_LONGEST = 3
-"""Samples of a spike at most."""
+_LONGEST, _BESIDE = 3, 4
+"""Samples of a spike at most, and samples on either side with which it is compared."""
 
 _USUAL, _BEYOND = 0.995, 4.0
 """Quantile of the distances from the running median, and how many times of it a spike has: the
@@ -49,28 +49,26 @@ _MOST_SPIKES = 20
 _TOP_SHARE, _TOP_STDS = 0.004, 4.0
 """Share of a force, and standard deviations, within which a mean stroke is at its level."""
 
-_FASTEST = 0.9
-"""Share of the peak speed above which the median of a mean stroke is the level it may stay at."""
+_SHARES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+"""Shares of the peak speed from which on a force may stay at its level."""
+
+_FEWEST_PLACES, _FEWEST_SAMPLES = 6, 12
+"""Places along a stroke, and samples, that such a line is fitted to."""
 
 _BUT_CORNERS, _ROUNDED = 0.95, 0.01
 """Quantile of a mean stroke's forces that counts as its largest, and share of a level by which that
 may exceed it: a spline overshoots at a corner."""
 
-_LEAST_PLATEAU = 0.05
-"""Share of the peak speed over which a force has to stay at its level."""
-
-_CORNER = 0.15
-"""Share of a plateau's speeds at its entry where the mean stroke rounds the corner."""
-
-_FLAT = 0.03
+_FLAT = 0.1
 """Slope at the level over the slope below it, which a clipped cell stays under with its 95 %
-interval. Of digressive dampers the slope above the knee is a twentieth to a third of that below."""
+interval, and which is not above zero with it: above their knee dampers have a tenth to a third."""
 
 _SLOWEST_ENTRY = 0.1
-"""Share of the peak speed below which a level that is reached is that of dry friction."""
+"""Share of a level that the force has to rise by with speed: dry friction is there at once."""
 
-_BELOW = (0.7, 0.95)
-"""Shares of the speed at which a level is reached, between which the slope below it is taken."""
+_BELOW = (0.4, 0.95)
+"""Shares of the speed from which on a force may stay at its level, between which the slope below it
+is taken."""
 
 
 class SensorFaults(NamedTuple):
@@ -151,14 +149,18 @@ def find_spikes(values: Array) -> list[slice]:
     """
     distance = np.abs(values - median_filter(values, _WINDOW, mode="nearest"))
     least = _BEYOND * float(np.quantile(distance, _USUAL))
-    beside = np.pad(values, 1, mode="edge")
     spikes: list[slice] = []
     for found in find_stretches(distance > least):
-        # It leaves one neighbour and returns to the other; a jump to another level does not.
-        leaves = float(values[found.start] - beside[found.start])
-        returns = float(values[found.stop - 1] - beside[found.stop + 1])
-        is_short = found.stop - found.start <= _LONGEST
-        if is_short and leaves * returns > 0.0 and min(abs(leaves), abs(returns)) > least:
+        before = values[max(found.start - _BESIDE, 0) : found.start]
+        after = values[found.stop : found.stop + _BESIDE]
+        if found.stop - found.start > _LONGEST or min(len(before), len(after)) < 2:
+            continue
+        # It leaves one neighbour and returns to the other, by far more than these move; a jump to
+        # another level does not, nor does the peak of a fast stroke.
+        leaves = float(values[found.start] - before[-1])
+        returns = float(values[found.stop - 1] - after[0])
+        usual = max(float(np.abs(np.diff(side)).max()) for side in (before, after))
+        if leaves * returns > 0.0 and min(abs(leaves), abs(returns)) > max(least, _BEYOND * usual):
             spikes.append(found)
     return spikes if len(spikes) <= _MOST_SPIKES else []
 
@@ -171,9 +173,15 @@ def find_plateau_limits(force_n: Array) -> ForceRange:
 
 def find_level_limits(strokes: Sequence[MeanStroke]) -> ForceRange:
     """Levels that the mean strokes of a record reach at speed and do not exceed."""
-    found = {sign: _level([it for it in strokes if it.sign == sign]) for sign in (-1, 1)}
     # Compression pushes: its largest force is the highest, that of rebound the lowest.
-    return ForceRange(-found[1], found[-1])
+    down, up = ([it for it in strokes if it.sign == sign] for sign in (-1, 1))
+    high_n, low_n = _level(down), _level(up)
+    # An amplifier is clipped in both directions alike: one may reach it for a moment only.
+    if math.isinf(high_n) and math.isfinite(low_n) and _reaches(down, low_n):
+        high_n = low_n
+    if math.isinf(low_n) and math.isfinite(high_n) and _reaches(up, high_n):
+        low_n = high_n
+    return ForceRange(-low_n, high_n)
 
 
 def _level(strokes: Sequence[MeanStroke]) -> float:
@@ -181,47 +189,91 @@ def _level(strokes: Sequence[MeanStroke]) -> float:
     levels = [level for stroke in strokes if (level := _level_of(stroke)) is not None]
     if not levels:
         return math.inf
-    largest = max(
-        float(np.quantile(-stroke.sign * stroke.force_n, _BUT_CORNERS)) for stroke in strokes
+    level_n = min(levels, key=lambda level: level.half_n).value_n
+    is_one = all(abs(it.value_n - level_n) <= it.half_n for it in levels)
+    return level_n if is_one and not any(_exceeds(it, level_n) for it in strokes) else math.inf
+
+
+def _exceeds(stroke: MeanStroke, level_n: float) -> bool:
+    """Whether a mean stroke is above a level, but for the overshoot of a spline at corners."""
+    force_n = -stroke.sign * stroke.force_n
+    largest_n = float(np.quantile(force_n, _BUT_CORNERS))
+    at = int(np.argmin(np.abs(force_n - largest_n)))
+    std_n = float(stroke.covariance[at, at]) ** 0.5
+    return largest_n > (1.0 + _ROUNDED) * level_n + _TOP_STDS * std_n
+
+
+def _reaches(strokes: Sequence[MeanStroke], level_n: float) -> bool:
+    """Whether strokes reach a level, and none exceeds it."""
+    largest_n = max((float((-it.sign * it.force_n).max()) for it in strokes), default=0.0)
+    is_there = largest_n >= (1.0 - _ROUNDED) * level_n
+    return is_there and not any(_exceeds(it, level_n) for it in strokes)
+
+
+class _Level(NamedTuple):
+    """A level at which a mean stroke stays, and by how much it is uncertain."""
+
+    value_n: float
+    half_n: float
+
+
+def _level_of(stroke: MeanStroke) -> _Level | None:
+    """The level that a stroke stays at about its largest speed, if it does.
+
+    Samples faster than some share of the largest speed are fitted by a level, a slope over speed
+    and one over height: of a clipped force both slopes are zero.
+    """
+    peak = float(np.abs(stroke.velocity_m_per_s).max())
+    if stroke.is_constant:
+        return None
+    for share in _SHARES:
+        top = _fit_line(stroke, share * peak, peak)
+        below = _fit_line(stroke, _BELOW[0] * share * peak, _BELOW[1] * share * peak)
+        if top is None or below is None or below.slope <= 0.0:
+            continue
+        half = 1.96 * top.slope_std
+        is_flat = top.slope <= half and top.slope + half <= _FLAT * below.slope
+        # A level that is reached at no speed is that of dry friction.
+        rises = below.slope * share * peak > _SLOWEST_ENTRY * top.level_n
+        if (
+            is_flat
+            and rises
+            and abs(top.spring_n) <= 1.96 * top.spring_std_n + _TOP_SHARE * top.level_n
+        ):
+            half_n = _TOP_SHARE * top.level_n + _TOP_STDS * top.level_std_n
+            return _Level(top.level_n, half_n)
+    return None
+
+
+class _Line(NamedTuple):
+    """Force at the mean of some speeds, its slope over speed, and its change over half a stroke."""
+
+    level_n: float
+    level_std_n: float
+    slope: float
+    slope_std: float
+    spring_n: float
+    spring_std_n: float
+
+
+def _fit_line(stroke: MeanStroke, slow: float, fast: float) -> _Line | None:
+    """A line through the samples between two speeds; None where there are too few."""
+    speed = np.abs(np.interp(FINE, ANGLES, stroke.velocity_m_per_s))
+    here = (stroke.samples > 0.0) & (speed >= slow) & (speed <= fast)
+    counts = stroke.samples[here]
+    if np.count_nonzero(here) < _FEWEST_PLACES or counts.sum() < _FEWEST_SAMPLES:
+        return None
+    force_n = -stroke.sign * stroke.sums_n[here] / counts
+    columns = (
+        np.ones(len(counts)),
+        speed[here] - np.average(speed[here], weights=counts),
+        np.sin(FINE[here]),
     )
-    is_one = max(levels) - min(levels) <= _TOP_SHARE * abs(levels[0])
-    return min(levels) if is_one and largest <= (1.0 + _ROUNDED) * max(levels) else math.inf
-
-
-def _level_of(stroke: MeanStroke) -> float | None:
-    """The level that a mean stroke stays at about its largest speed, if it does."""
-    speed = np.abs(stroke.velocity_m_per_s)
-    force = -stroke.sign * stroke.force_n
-    top = int(np.argmax(speed))
-    peak = float(speed[top])
-    level = float(np.median(force[speed >= _FASTEST * peak]))
-    half = _TOP_SHARE * abs(level) + _TOP_STDS * float(stroke.covariance[top, top]) ** 0.5
-    stretches = find_stretches(force >= level - half)
-    inside = next((it for it in stretches if it.start <= top < it.stop), None)
-    if stroke.is_constant or inside is None:
-        return None
-    entry = float(max(speed[inside.start], speed[inside.stop - 1]))
-    if entry < _SLOWEST_ENTRY * peak or peak - entry < _LEAST_PLATEAU * peak:
-        return None
-    # The slope by speed is the mean of speeding up and slowing down, in which a spring cancels.
-    at = np.zeros(len(speed), np.bool_)
-    at[inside] = speed[inside] >= entry + _CORNER * (peak - entry)
-    about = np.where(at, speed - float(speed[at].mean()), 0.0)
-    row = about / float(about @ about)
-    slope = float(row @ force)
-    std = float(row @ stroke.covariance @ row) ** 0.5
-    below = _slope_below(speed, force, entry)
-    is_flat = below > 0.0 and slope + 1.96 * std <= _FLAT * below
-    return float(force[at].mean()) if is_flat else None
-
-
-def _slope_below(speed: Array, force: Array, entry: float) -> float:
-    """Slope of force over speed below some speed, mean of both halves of the stroke."""
-    low, high = (share * entry for share in _BELOW)
-    top = int(np.argmax(speed))
-    slopes: list[float] = []
-    for half in (slice(None, top + 1), slice(top, None)):
-        order = np.argsort(speed[half])
-        at_low, at_high = np.interp((low, high), speed[half][order], force[half][order])
-        slopes.append(float(at_high - at_low) / (high - low))
-    return float(np.mean(slopes))
+    design = np.column_stack(columns) * np.sqrt(counts)[:, None]
+    target = force_n * np.sqrt(counts)
+    weights = np.linalg.lstsq(design, target, rcond=None)[0]
+    residual = target - design @ weights
+    variance = float(residual @ residual) / max(len(counts) - 3, 1)
+    stds = np.sqrt(variance * np.diag(np.linalg.pinv(design.T @ design)))
+    pairs = zip(weights.tolist(), stds.tolist(), strict=True)
+    return _Line(*(float(value) for pair in pairs for value in pair))

@@ -213,9 +213,6 @@ def _find_runs(strokes: list[Stroke]) -> list[list[Stroke]]:
 
 def _split_by_shape(t_s: Array, height_m: Array, run: list[Stroke]) -> Iterator[list[Stroke]]:
     """Parts of a run between strokes whose shape is not the usual one, three strokes at least."""
-    if len(run) < _FEWEST_UNLIKE_A_SERIES:
-        yield run
-        return
     apart = np.zeros(len(run))
     for side in (slice(0, None, 2), slice(1, None, 2)):
         # As shares of the rise.
@@ -337,12 +334,18 @@ def _turns_slowly(height_m: Array, still_m: float) -> bool:
     return float(np.ptp(curve)) > _BENT * still_m
 
 
-def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
-    """Height and velocity of a block, from its times and measured heights, shape (N,)."""
+def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | None:
+    """Height and velocity of a block, from its times and measured heights, shape (N,).
+
+    None where they are neither a Fourier series nor can be smoothed.
+    """
     series = _fourier_series(t_s - t_s[0], height_m, strokes)
     if series is not None:
         return series
-    smoothed = smooth(t_s, height_m, estimate_noise(t_s, height_m))
+    try:
+        smoothed = smooth(t_s, height_m, estimate_noise(t_s, height_m))
+    except np.linalg.LinAlgError:  # noise below what doubles resolve over a slow stroke
+        return None
     height, velocity = smoothed.states[:, 0].copy(), smoothed.states[:, 1].copy()
     fine_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), _BETWEEN * len(t_s))
     curve = CubicHermiteSpline(t_s, height, velocity)
@@ -419,8 +422,8 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
 
 
 def _fit_columns(made: Array, height_m: Array) -> Array:
-    """Weights of least squares; columns of a Fourier series over whole strokes are independent."""
-    return np.asarray(np.linalg.solve(made.T @ made, made.T @ height_m), np.float64)
+    """Weights of least squares, by the normal equations of nearly independent columns."""
+    return np.asarray(np.linalg.lstsq(made.T @ made, made.T @ height_m, rcond=None)[0], np.float64)
 
 
 def _harmonics(t_s: Array, frequency_hz: float, count: int) -> Array:

@@ -48,6 +48,8 @@ class Day:
     clips_n: float = math.inf
     clips_noise: bool = False
     spikes: int = 0
+    zero_n: float = 0.0
+    begins_k: float = 0.0
     warms_k: float = 0.0
     per_kelvin: float = 0.0
 
@@ -82,11 +84,11 @@ class Day:
         return x, v
 
     def warm_k(self, t_s):
-        """Temperature above that of the start, towards an end."""
-        return self.warms_k * (1.0 - np.exp(-3.0 * t_s / self.length_s))
+        """Temperature above 22 °C: that of the beginning, and what the test warms the damper by."""
+        return self.begins_k + self.warms_k * (1.0 - np.exp(-3.0 * t_s / self.length_s))
 
     def force(self, x, v, warm_k):
-        """True forces of a motion at a temperature above that of the start."""
+        """True forces of a motion at a temperature above 22 °C."""
         cold = forces(self.damper, x, v, 1.0 / self.rate_hz)
         return cold + self.per_kelvin * warm_k * law(self.damper, v)
 
@@ -100,7 +102,7 @@ class Day:
         x, _ = self.motion(t_s)
         late_s = t_s - self.lag_s
         force = self.force(*self.motion(late_s), self.warm_k(late_s))
-        force = force + self.drift_n * t_s / self.length_s
+        force = force + self.zero_n + self.drift_n * t_s / self.length_s
         noise = self.noise_n * rng.standard_normal(len(t_s))
         if self.clips_noise:
             force = np.clip(force + noise, -self.clips_n, self.clips_n)

@@ -12,8 +12,10 @@ from typer.testing import CliRunner
 from can_dbc.errors import InputError
 from rig.cli.main import app
 from rig.dyno.characterise import ForceRecord, characterise_record
-from rig.dyno.comparison import compare_dampers, trends_over_dose
+from rig.dyno.comparison import compare_dampers, list_not_comparable, trends_over_dose
 from rig.dyno.tolerance import evaluate_band, load_tolerance
+from tests.dyno.days import usual
+from tests.dyno.pairs import study
 from tests.dyno.test_characteristics import written
 
 HEADER = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"
@@ -21,8 +23,8 @@ RATE_HZ = 200.0
 SPEEDS = (0.003, 0.1, 0.3)
 
 
-def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0):
-    """A slow cycle and two speeds of a linear damper with gas and friction."""
+def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0, zero_n=0.0):
+    """A slow cycle and two speeds of a linear damper with friction and a column of gas."""
     rng = np.random.default_rng(seed)
     x, v = [], []
     for speed in SPEEDS:
@@ -32,7 +34,8 @@ def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0):
         x.append(0.02 * np.sin(angle))
         v.append(speed * np.cos(angle))
     x_m, rate = np.concatenate(x), np.concatenate(v)
-    force = gas_n - 3000.0 * x_m - damping * rate - friction_n * np.sign(rate)
+    gas = gas_n * (1.0 - 15.0 * x_m)
+    force = zero_n + gas - damping * rate - friction_n * np.sign(rate)
     t_s = np.arange(len(x_m)) / RATE_HZ
     noise = 1e-6 * rng.standard_normal(len(t_s)), 3.0 * rng.standard_normal(len(t_s))
     return t_s, 0.3 + x_m + noise[0], force + noise[1]
@@ -72,6 +75,38 @@ def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched
     assert item.differs
     assert item.change.low <= by <= item.change.high
     assert not any(found[other].differs for other in untouched)
+
+
+def test_a_zero_of_the_load_cell_is_no_difference():
+    """All forces are shifted, and the spring rate is not: that is listed, and removed."""
+    before, after = state(1), state(2, zero_n=12.0)
+    assert not any(item.differs for item in compare_dampers(before, after))
+    assert any(
+        "all forces are shifted by +1" in text and "zero of the load cell" in text
+        for text in list_not_comparable([before, after])
+    )
+
+
+@pytest.mark.slow
+def test_other_conditions_are_no_differences_and_hide_none():
+    """Temperature, zero, lag and rate differ at random; what was changed is seen all the same."""
+    found = study(8, 2, 3)
+    assert found["none"].figures > 200
+    assert found["none"].called <= 0.01 * found["none"].figures
+    assert all(it.seen == it.pairs for change, it in found.items() if change != "none")
+
+
+@pytest.mark.slow
+def test_temperatures_apart_without_a_change_per_kelvin_are_not_comparable():
+    records = []
+    for seed, begins_k in ((1, 0.0), (2, 10.0)):
+        day = usual(begins_k=begins_k, per_kelvin=-0.002, rate_hz=500.0)
+        warm_c = day.temperatures(seed)
+        record = ForceRecord(f"at {22 + begins_k} °C", *day.record(seed), temperature_c=warm_c)
+        records.append(characterise_record(record))
+    assert not any(item.differs for item in compare_dampers(*records))
+    said = list_not_comparable(records)
+    assert sum("+10.0 K from at 22.0 °C" in text for text in said) == len(records[0].steps)
 
 
 @pytest.mark.slow

@@ -221,9 +221,11 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     # Where the likelihood hardly differs, the smoothest: a white signal has no best one.
     best = int(np.argmax(np.array(values) <= min(values) + _AS_LIKELY))
     left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    optimum = minimize_scalar(
-        deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
-    )
+    # Where the filter fails the likelihood is infinite, and the search goes elsewhere.
+    with np.errstate(invalid="ignore"):
+        optimum = minimize_scalar(
+            deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
+        )
     log_ratio = float(optimum.x)
     squares, _, count = sums(log_ratio)
     return Noise(squares / count, float(np.exp(log_ratio)))
