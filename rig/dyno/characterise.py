@@ -114,10 +114,12 @@ def characterise_record(
     rests = find_holds(t_s, height_m, blocks)
     kept, rejected = _compute_steps(record, blocks, faults.limits, NO_CORRECTIONS)
     levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
-    faults = faults._replace(limits=faults.limits.within(levels))
+    if levels != ForceRange():
+        faults = faults._replace(limits=faults.limits.within(levels))
+        kept, rejected = _compute_steps(record, blocks, faults.limits, NO_CORRECTIONS)
     drift = estimate_drift(record, blocks, [compute_rest(record, here) for here in rests])
     corrections = decide(wanted, record, [step for _, step in kept], drift)
-    if levels != ForceRange() or corrections.any:
+    if corrections.any:
         record = corrections.apply(record)
         kept, rejected = _compute_steps(record, blocks, faults.limits, corrections)
     if not kept:

@@ -120,6 +120,8 @@ def find(report: DamperReport) -> str:
         texts.append(_words_of_points(report.points))
     if not texts:
         texts.append(_forces(report.characteristics))
+    if any(it.is_clipped for step in report.characteristics.steps for it in step.strokes):
+        texts.append("The load cell was clipped: forces that reach its limit are bounds")
     return "".join(f"{text}. " for text in texts).rstrip()
 
 
