@@ -144,6 +144,9 @@ def _draw_in(units: PlotUnits, reports: Sequence[DamperReport]) -> DamperPicture
     return DamperPictures(peaks, *loops)
 
 
+_BOUND = "clipped: at least this"
+
+
 def _draw_peaks(axes: Any, reports: Sequence[DamperReport], units: PlotUnits) -> None:
     """Force at peak velocity over peak velocity, with band and master."""
     first, points = reports[0], reports[0].points
@@ -166,13 +169,11 @@ def _draw_peaks(axes: Any, reports: Sequence[DamperReport], units: PlotUnits) ->
                 linewidth=1.4, marker="." if report.points else marker, markersize=5, label=name,
             )  # fmt: skip
             if is_bound.any():
-                has_bound = any(
-                    label.startswith("clipped") for label in axes.get_legend_handles_labels()[1]
-                )
+                has_bound = _BOUND in axes.get_legend_handles_labels()[1]
                 arrow = {"marker": "^" if side == SIDES[0] else "v", "markersize": 9}
                 axes.plot(
                     speeds[is_bound], forces_n[is_bound], color=colour, linestyle="", **arrow,
-                    label="" if has_bound else "clipped: at least this",
+                    label="" if has_bound else _BOUND,
                 )  # fmt: skip
     _draw_verdicts(axes, points, units)
     axes.axhline(0.0, color=_AXIS, linewidth=0.8)
