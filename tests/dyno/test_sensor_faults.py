@@ -10,8 +10,13 @@ from can_dbc.errors import InputError
 from rig.dyno.characterise import characterise_record
 from rig.dyno.corrections import WantedCorrections
 from rig.dyno.figures import ForceRecord
-from tests.dyno.days import Step, usual
+from tests.dyno import days
+from tests.dyno.days import Step
 from tests.dyno.population import Damper
+
+
+def usual(**changes):
+    return days.usual(rate_hz=500.0, **changes)
 
 
 def characterised(day, wanted=None, seed=1):
