@@ -85,8 +85,8 @@ def open_rows(
     except (UnicodeError, csv.Error) as error:
         encoding = layout.encoding.removesuffix("-sig").upper()
         raise InputError(
-            f"{name}: is no text in {encoding}, expected one, or its encoding in the mapping "
-            "(table.encoding)"
+            f"{name}: is no text in {encoding}, expected one; `rig import TABLE --mapping FILE` "
+            "reads a foreign table in the encoding that the mapping states (table.encoding)"
         ) from error
 
 
