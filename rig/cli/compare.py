@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "Examples: `rig compare before.csv after.csv --out compared` · "
+    "`rig compare left.csv right.csv --tolerance band.yaml` · "
     "`rig compare 2bar.csv 4bar.csv 6bar.csv --dose 2 --dose 4 --dose 6`"
 )
 
@@ -43,6 +44,14 @@ def compare_command(
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
     lag: LagFlag = True,
+    tolerance: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Tolerance band, YAML or CSV: state the difference of two dampers, such as left "
+            "and right, in per cent of its width.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for comparison.json and report.html."),
@@ -56,11 +65,13 @@ def compare_command(
     these numbers.
     """
     from rig.dyno.characterise import characterise
-    from rig.dyno.comparison import compare_dampers, trends_over_dose
+    from rig.dyno.comparison import compare_dampers, match_in_band, trends_over_dose
     from rig.dyno.corrections import WantedCorrections
+    from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
     from rig.pages.comparison_page import (
         difference_tables,
+        match_table,
         summarise_differences,
         summarise_trends,
         trend_tables,
@@ -71,20 +82,30 @@ def compare_command(
         raise InputError(
             f"{len(runs)} given, expected two records to compare, or --dose NUMBER once for each"
         )
+    if dose and tolerance is not None:
+        raise InputError("--tolerance: expected two records, without --dose")
     if out is not None:
         refuse_full(out)
+    band = None if tolerance is None else load_tolerance(tolerance)
     labels = parse_labels(label or [])
     wanted = WantedCorrections(zero, lag)
     records = [characterise(path, strut, wanted) for path in runs]
+    content: dict[str, object] = {"schema": 1}
     if dose:
         trends = trends_over_dose(records, dose)
-        content = {"schema": 1, "trends": trends}
+        content["trends"] = trends
         summary, tables = summarise_trends(trends, records), trend_tables(trends)
     else:
+        names = [record.name for record in records]
         differences = compare_dampers(*records)
-        content = {"schema": 1, "differences": differences}
+        content["differences"] = differences
         summary = summarise_differences(differences, records)
-        tables = difference_tables(differences, *(record.name for record in records))
+        tables = difference_tables(differences, *names)
+        if band is not None:
+            left, right = records
+            matches = match_in_band(left, right, band)
+            content["match"] = matches
+            tables = (match_table(matches, *names), *tables)
     if out is not None:
         _write(records, summary, tables, content, out, labels)
     if as_json:
@@ -111,17 +132,17 @@ def _write(
 
 
 def _print(
-    records: "Sequence[Characteristics]",
-    summary: str,
-    tables: "tuple[ComparisonTable, ComparisonTable]",
+    records: "Sequence[Characteristics]", summary: str, tables: "Sequence[ComparisonTable]"
 ) -> None:
     from rig.dyno.comparison import list_not_comparable
+    from rig.pages.comparison_page import notes_on
 
     print_text(f"{summary[:1].upper()}{summary[1:]}.")
-    changed, others = tables
-    if changed.rows:
-        rows = [(row.figure, *row.cells) for row in changed.rows]
-        print_table(changed.heads, rows, changed.title)
+    *shown, others = tables
+    for table in shown:
+        if table.rows:
+            rows = [(row.figure, *row.cells) for row in table.rows]
+            print_table(table.heads, rows, table.title)
     if others.rows:
         texts = (
             f"{row.figure} ({others.heads[-1].lower()} {row.cells[-1]})" for row in others.rows
@@ -129,3 +150,5 @@ def _print(
         print_text(f"{others.title}: {'; '.join(texts)}.")
     for text in list_not_comparable(records):
         print_text(f"- not comparable: {text}")
+    for text in notes_on(records):
+        print_text(f"- {text}")

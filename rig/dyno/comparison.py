@@ -22,6 +22,7 @@ from rig.dyno.conditions import Conditions, apart_k, find_conditions, slowest
 from rig.dyno.damper import FRICTION, GAS, GAS_RATE
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure, student_factor
+from rig.dyno.tolerance import ToleranceBand, evaluate_band
 
 _ALIKE = 0.1
 """Relative difference of speed and amplitude up to which steps are compared."""
@@ -49,6 +50,16 @@ class Difference(NamedTuple):
     after: Figure
     change: Figure
     differs: bool
+
+
+class Match(NamedTuple):
+    """Two dampers at a point of a band: their forces, and the difference over the band's width."""
+
+    velocity_m_per_s: float
+    side: str
+    left: Figure
+    right: Figure
+    share: Figure
 
 
 class Trend(NamedTuple):
@@ -84,6 +95,31 @@ def compare_dampers(before: Characteristics, after: Characteristics) -> list[Dif
         item._replace(differs=differ) for item, differ in zip(differences, differs, strict=True)
     ]
     return sorted(marked, key=lambda item: not item.differs)
+
+
+def match_in_band(
+    left: Characteristics, right: Characteristics, band: ToleranceBand
+) -> list[Match]:
+    """Differences of two dampers at the points of a band, as shares of its width, largest first.
+
+    Points that one of them does not have are left out.
+    """
+    pairs = zip(evaluate_band(left.steps, band), evaluate_band(right.steps, band), strict=True)
+    matches: list[Match] = []
+    for one, other in pairs:
+        if one.force is None or other.force is None:
+            continue
+        if not (one.force.is_bounded and other.force.is_bounded):
+            continue
+        change, width_n = _difference(other.force, one.force), one.high_n - one.low_n
+        share = Figure(
+            change.value / width_n,
+            change.low / width_n,
+            change.high / width_n,
+            "difference over the width of the band",
+        )
+        matches.append(Match(one.velocity_m_per_s, one.side, one.force, other.force, share))
+    return sorted(matches, key=lambda item: -abs(item.share.value))
 
 
 def trends_over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[Trend]:

@@ -78,9 +78,7 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     slowest = min(slow, key=lambda step: step.peak_speed_m_per_s, default=None)
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
     usual = [step for step in steps if step.kind != "warm_up"] or steps
-    spring = (
-        spring_curve(min(slow, key=lambda it: it.peak_speed_m_per_s)) if slow else np.zeros_like
-    )
+    spring = None if slowest is None else spring_curve(slowest)
     strokes = {name: [step.strokes[index] for step in usual] for index, name in enumerate(SIDES)}
     moving = {
         name: [step.strokes[index] for step in usual if step.kind != "quasi_static"]

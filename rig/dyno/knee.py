@@ -47,6 +47,10 @@ _MISFIT = 0.003
 _KNEES = 240
 """Knees that are tried, evenly spread by their logarithm: over two decades 2 % apart."""
 
+_END, _BEND = 1.4, 0.2
+"""Angle, in rad, at which a spring's change over half a stroke is read, and how much of it is bent:
+a gas column of twice the stroke has a fifth."""
+
 _FEWEST = 6
 """Speeds from which on a knee is looked for: two lines that meet have four parameters."""
 
@@ -62,10 +66,13 @@ class Knee(NamedTuple):
     above_n_s_per_m: Figure
 
 
-def find_knee(strokes: Sequence[MeanStroke], spring: Callable[[Array], Array]) -> Knee | None:
+def find_knee(
+    strokes: Sequence[MeanStroke], spring: Callable[[Array], Array] | None
+) -> Knee | None:
     """The knee of one direction, from the mean strokes of its steps; None where there is none.
 
-    `spring` gives the spring force at heights, which is removed from each stroke.
+    `spring` gives the spring force at heights, which is removed from each stroke; None where it is
+    not known.
     """
     if not strokes:
         return None
@@ -130,7 +137,9 @@ def _slope(row: Array, weights: Array, covariance: Array, *, sign: int) -> Figur
     return Figure(value, value - half, value + half, "line on its side of the knee")
 
 
-def _points(stroke: MeanStroke, spring: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+def _points(
+    stroke: MeanStroke, spring: Callable[[Array], Array] | None
+) -> tuple[Array, Array, Array]:
     """Speeds of a stroke, forces there without the spring, and their covariance.
 
     Speeds at which the force was clipped are left out.
@@ -155,7 +164,13 @@ def _points(stroke: MeanStroke, spring: Callable[[Array], Array]) -> tuple[Array
     rows = np.atleast_2d(rows)
     whole = ~np.any(rows[:, stroke.beyond != 0] != 0.0, axis=1)
     at, rows = at[whole], rows[whole]
-    return at, rows @ (stroke.force_n - spring(stroke.height_m)), rows @ stroke.covariance @ rows.T
+    covariance = rows @ stroke.covariance @ rows.T
+    if spring is not None:
+        return at, rows @ (stroke.force_n - spring(stroke.height_m)), covariance
+    # Of a spring that is not known, the straight part cancels, and its bend remains.
+    straight_n = abs(float((stroke.row(-_END) - stroke.row(_END))[0] @ stroke.force_n)) / 2.0
+    bend_n = _BEND * straight_n * (1.0 - (at / float(speed.max())) ** 2)
+    return at, rows @ stroke.force_n, covariance + np.outer(bend_n, bend_n)
 
 
 def _row_at(speed: Array, value: float, offset: int) -> Array:

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rig.dyno.characterise import Characteristics
-from rig.dyno.comparison import Difference, Trend, list_not_comparable, pair_steps
+from rig.dyno.comparison import Difference, Match, Trend, list_not_comparable, pair_steps
 from rig.dyno.report import DamperReport
+from rig.dyno.stroke_force import Figure
 from rig.pages.characteristics_page import SIGNS, signed, text_of
 from rig.pages.damper_pictures import draw_damper
 from rig.pages.html import render_report, write_page
@@ -49,9 +50,15 @@ def write_comparison_page(
         pictures=draw_damper([DamperReport(record) for record in records]),
         tables=[table for table in tables if table.rows],
         missing=list_not_comparable(records),
+        notes=notes_on(records),
         signs=SIGNS,
     )
     write_page(text, path)
+
+
+def notes_on(records: Sequence[Characteristics]) -> list[str]:
+    """What in the records may mislead, each note with its record."""
+    return [f"{record.name}: {note}" for record in records for note in record.quality]
 
 
 def summarise_differences(
@@ -104,6 +111,28 @@ def trend_tables(trends: Sequence[Trend]) -> tuple[ComparisonTable, ComparisonTa
         _trend_table("Changes over the dose", changing),
         _trend_table("Not shown to change", steady),
     )
+
+
+def match_table(matches: Sequence[Match], left: str, right: str) -> ComparisonTable:
+    """How far two dampers are apart at the points of a band, the farthest first."""
+    rows = [
+        Row(
+            f"{item.side} at {with_unit(f'{item.velocity_m_per_s:.3g}', 'm/s')}",
+            (
+                text_of(item.left, "N"),
+                text_of(item.right, "N"),
+                signed(_percent(item.share), "%"),
+            ),
+        )
+        for item in matches
+    ]
+    largest = max((abs(item.share.value) for item in matches), default=0.0)
+    title = f"Match: at most {100.0 * largest:.0f} % of the band apart"
+    return ComparisonTable(title, ("Point", left, right, "Difference over the band"), rows)
+
+
+def _percent(share: Figure) -> Figure:
+    return Figure(100.0 * share.value, 100.0 * share.low, 100.0 * share.high, share.method)
 
 
 def _trend_table(title: str, trends: Sequence[Trend]) -> ComparisonTable:

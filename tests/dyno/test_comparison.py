@@ -12,7 +12,12 @@ from typer.testing import CliRunner
 from can_dbc.errors import InputError
 from rig.cli.main import app
 from rig.dyno.characterise import ForceRecord, characterise_record
-from rig.dyno.comparison import compare_dampers, list_not_comparable, trends_over_dose
+from rig.dyno.comparison import (
+    compare_dampers,
+    list_not_comparable,
+    match_in_band,
+    trends_over_dose,
+)
 from rig.dyno.tolerance import evaluate_band, load_tolerance
 from tests.dyno.days import usual
 from tests.dyno.pairs import study
@@ -85,6 +90,22 @@ def test_a_zero_of_the_load_cell_is_no_difference():
         "all forces are shifted by +1" in text and "zero of the load cell" in text
         for text in list_not_comparable([before, after])
     )
+
+
+def test_two_dampers_match_in_per_cent_of_a_band(tmp_path):
+    (tmp_path / "band.yaml").write_text(BAND)
+    band = load_tolerance(tmp_path / "band.yaml")
+    found = match_in_band(state(1), state(2, damping=1350.0), band)
+    # The band is 30 and 20 N wide at 0.1 m/s, where a tenth of the damping is 15 N, and 50 and 20 N
+    # at 0.2 m/s, which lies between two steps; nothing was measured at 0.9 m/s.
+    assert {item.velocity_m_per_s for item in found} == {0.1, 0.2}
+    by_point = {(item.side, item.velocity_m_per_s): item for item in found}
+    share = by_point["compression", 0.1].share
+    assert share.low <= -15.0 / 30.0 <= share.high
+    share = by_point["rebound", 0.1].share
+    assert share.low <= 15.0 / 20.0 <= share.high
+    sizes = [abs(item.share.value) for item in found]
+    assert sizes == sorted(sizes, reverse=True)
 
 
 @pytest.mark.slow
