@@ -109,7 +109,7 @@ def master_of(record: Characteristics) -> Master:
         )
     slowest, *others = sorted(record.steps, key=lambda step: step.peak_speed_m_per_s)
     fastest = max(record.steps, key=lambda step: step.peak_speed_m_per_s)
-    friction_n, gas_n = damper.friction_n.value, damper.gas_force_n.value
+    friction_n, gas_n = slowest.half_difference_n.value, slowest.mean_force_n.value
     if others:
         # Bleed in the slowest step: the increase up to the next step, scaled by speed.
         speed, more = slowest.peak_speed_m_per_s, others[0]
