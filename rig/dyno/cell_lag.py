@@ -62,14 +62,14 @@ class _Rows(NamedTuple):
     target: Array
 
 
-class Lag(NamedTuple):
+class CellLag(NamedTuple):
     """A lag in s, and whether all steps agree on it."""
 
     figure: Figure
     is_one: bool
 
 
-def estimate_lag(steps: Sequence[DynoStep]) -> Lag | None:
+def estimate_lag(steps: Sequence[DynoStep]) -> CellLag | None:
     """What a record's force lags its height by; None with too few steps or frequencies.
 
     A step alone does not tell a lag from a force with memory, such as that of a friction damper.
@@ -89,8 +89,8 @@ def estimate_lag(steps: Sequence[DynoStep]) -> Lag | None:
         fit = _fit(strokes, fit.lag_s + fit.more_s)
     half = student_factor(fit.freedom) * fit.std_s
     text = f"hysteresis at equal speeds, {len(strokes)} steps"
-    figure = Figure(fit.lag_s, fit.lag_s - half, fit.lag_s + half, text)
-    return Lag(figure, _agree(fit))
+    figure = Figure.around(fit.lag_s, half, text)
+    return CellLag(figure, _agree(fit))
 
 
 class _LagFit(NamedTuple):

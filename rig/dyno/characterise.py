@@ -11,15 +11,23 @@ from rig.dyno.corrections import (
     ALL_CORRECTIONS,
     NO_CORRECTIONS,
     Corrections,
-    WantedCorrections,
+    RequestedCorrections,
     decide,
 )
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
-from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
+from rig.dyno.figures import (
+    LOAD_CELL,
+    AtRest,
+    DynoStep,
+    ForceRecord,
+    compute_rest,
+    compute_step,
+    find_motion,
+)
 from rig.dyno.quality import quality
 from rig.dyno.sensor_faults import find_level_limits, judge_sensors
 from rig.dyno.stroke_force import ForceRange
-from rig.dyno.strokes import Array, Block, find_blocks, find_holds, find_strokes
+from rig.dyno.strokes import Array, Block, BlockMotion, find_blocks, find_holds, find_strokes
 from rig.dyno.timeline import Span, account
 from rig.dyno.zero_drift import estimate_drift
 from rig.log.reader import read_run
@@ -72,11 +80,11 @@ class Characteristics:
 
 
 def characterise(
-    path: Path, strut: str | None = None, wanted: WantedCorrections = ALL_CORRECTIONS
+    path: Path, strut: str | None = None, requested: RequestedCorrections = ALL_CORRECTIONS
 ) -> Characteristics:
     """Figures of a damper from a run's folder or a CSV of measured data.
 
-    `strut` may be None where a run has only one; the wanted corrections are applied.
+    `strut` may be None where a run has only one; the requested corrections are applied.
 
     Raises:
         InputError: There is no such record, or no cycle in it repeats.
@@ -95,12 +103,12 @@ def characterise(
             name,
             source,
         ),
-        wanted,
+        requested,
     )
 
 
 def characterise_record(
-    record: ForceRecord, wanted: WantedCorrections = ALL_CORRECTIONS
+    record: ForceRecord, requested: RequestedCorrections = ALL_CORRECTIONS
 ) -> Characteristics:
     """Figures of a damper from its record, without missing values.
 
@@ -112,16 +120,17 @@ def characterise_record(
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(t_s, height_m, strokes)
     rests = find_holds(t_s, height_m, blocks)
-    kept, rejected = _compute_steps(record, blocks, faults.limits, NO_CORRECTIONS)
+    moving = [(block, find_motion(record, block)) for block in blocks]
+    kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
     levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
     if levels != ForceRange():
         faults = faults._replace(limits=faults.limits.within(levels))
-        kept, rejected = _compute_steps(record, blocks, faults.limits, NO_CORRECTIONS)
+        kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
     drift = estimate_drift(record, blocks, [compute_rest(record, here) for here in rests])
-    corrections = decide(wanted, record, [step for _, step in kept], drift)
+    corrections = decide(requested, record, [step for _, step in kept], drift)
     if corrections.any:
         record = corrections.apply(record)
-        kept, rejected = _compute_steps(record, blocks, faults.limits, corrections)
+        kept, rejected = _compute_steps(record, moving, faults.limits, corrections)
     if not kept:
         raise InputError(
             f"{record.name}: no steady cycle in {len(strokes)} strokes: never three in a row of "
@@ -138,16 +147,16 @@ def characterise_record(
 
 def _compute_steps(
     record: ForceRecord,
-    blocks: Sequence[Block],
+    moving: Sequence[tuple[Block, BlockMotion | None]],
     limits: ForceRange,
     corrections: Corrections,
 ) -> tuple[list[tuple[Block, DynoStep]], dict[int, str]]:
     """Blocks with their figures, and why others have none by the first sample of their strokes."""
     kept: list[tuple[Block, DynoStep]] = []
     rejected: dict[int, str] = {}
-    for block in blocks:
+    for block, motion in moving:
         times_s = record.t_s[block.begin : block.end]
-        step = compute_step(record, block, corrections.limits_in(limits, times_s))
+        step = compute_step(record, block, motion, corrections.limits_in(limits, times_s))
         if isinstance(step, str):
             rejected |= {stroke.first: step for stroke in block.strokes}
         else:
@@ -170,7 +179,7 @@ def _read_strut(
                 f"{path}: has no strut_force_n, expected the force of a load cell "
                 "in a column of that name"
             )
-        return "", recording.heights_m[:, 0], cells_n[:, 0], "load cell"
+        return "", recording.heights_m[:, 0], cells_n[:, 0], LOAD_CELL
     run = read_run(path)
     config = run.header.get("config", {})
     names = list(config.get("observers", {}))
@@ -182,7 +191,7 @@ def _read_strut(
     index = list(config.get("signals", {})["height"]).index(name)
     height_m = recording.heights_m[:, index]
     if cells_n is not None:
-        return name, height_m, cells_n[:, index], "load cell"
+        return name, height_m, cells_n[:, index], LOAD_CELL
     tick_s = np.asarray(run.steps.column("t_ns").to_numpy(), np.float64) * 1e-9
     estimated = np.asarray(run.steps.column(f"{name}.force_n").to_numpy(), np.float64)
     known = np.isfinite(estimated)

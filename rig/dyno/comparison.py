@@ -18,7 +18,16 @@ from scipy.special import ndtr  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.conditions import Conditions, apart_k, find_conditions, slowest
+from rig.dyno.conditions import (
+    FRICTION_PER_K,
+    GAS_PER_K,
+    TYPICAL_PER_K,
+    RecordConditions,
+    apart_k,
+    find_conditions,
+    slowest,
+    widen,
+)
 from rig.dyno.damper import FRICTION, GAS, GAS_RATE
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure, student_factor
@@ -112,11 +121,8 @@ def match_in_band(
         if not (one.force.is_bounded and other.force.is_bounded):
             continue
         change, width_n = _difference(other.force, one.force), one.high_n - one.low_n
-        share = Figure(
-            change.value / width_n,
-            change.low / width_n,
-            change.high / width_n,
-            "difference over the width of the band",
+        share = change.scaled(1.0 / width_n)._replace(
+            method="difference over the width of the band"
         )
         matches.append(Match(one.velocity_m_per_s, one.side, one.force, other.force, share))
     return sorted(matches, key=lambda item: -abs(item.share.value))
@@ -231,12 +237,12 @@ def _fit_trend(name: str, unit: str, doses: "np.ndarray", figures: Sequence[Figu
     covariance = np.linalg.inv(design.T @ design) * max(misfit, 1.0)
     half = (student_factor(freedom) if misfit > 1.0 else _STDS) * float(np.sqrt(covariance[1, 1]))
     at_zero, slope = (float(value) for value in weights)
-    figure = Figure(slope, slope - half, slope + half, f"line through {len(doses)} doses")
+    figure = Figure.around(slope, half, f"line through {len(doses)} doses")
     return Trend(name, unit, figure, at_zero, differs=False, is_straight=misfit < _MISFIT)
 
 
 def _common_figures(
-    items: Sequence[Characteristics], conditions: Conditions | None = None
+    items: Sequence[Characteristics], conditions: RecordConditions | None = None
 ) -> dict[str, tuple[str, list[Figure]]]:
     """Figures that all states have: by name the unit, and the figure of each state.
 
@@ -260,7 +266,7 @@ def _common_figures(
 
 
 def _figures_by_name(
-    item: Characteristics, reference: Characteristics, conditions: Conditions | None
+    item: Characteristics, reference: Characteristics, conditions: RecordConditions | None
 ) -> Mapping[str, tuple[str, Figure]]:
     """Figures by name; steps are called by their speed in the first record."""
     figures: dict[str, tuple[str, Figure | None]] = _of_damper(item, reference, conditions)
@@ -277,8 +283,8 @@ def _figures_by_name(
                 conditions.force(figure, side, warmer_k) for side, figure in enumerate((down, up))
             )
             energy = conditions.energy(energy, warmer_k)
-            rate = conditions.gas(rate, warmer_k)
-            hysteresis = conditions.friction(hysteresis, warmer_k)
+            rate = widen(rate, GAS_PER_K, warmer_k)
+            hysteresis = widen(hysteresis, FRICTION_PER_K, warmer_k)
         figures |= {
             f"compression force {at}": ("N", down),
             f"rebound force {at}": ("N", up),
@@ -296,16 +302,16 @@ def _figures_by_name(
 
 
 def _of_damper(
-    item: Characteristics, reference: Characteristics, conditions: Conditions | None
+    item: Characteristics, reference: Characteristics, conditions: RecordConditions | None
 ) -> dict[str, tuple[str, Figure | None]]:
     """Figures over all steps by name."""
-    own: dict[str, tuple[str, Figure | None]] = {**item.damper.properties()}
+    own = item.damper.properties()
     if conditions is None:
-        return own
+        return {**own}
     warmer_k = apart_k(slowest(reference), slowest(item))
-    wider = {GAS: conditions.gas, GAS_RATE: conditions.gas, FRICTION: conditions.friction}
-    figures = {
-        name: (unit, figure and wider.get(name, conditions.damping)(figure, warmer_k))
+    per_k = {GAS: GAS_PER_K, GAS_RATE: GAS_PER_K, FRICTION: FRICTION_PER_K}
+    figures: dict[str, tuple[str, Figure | None]] = {
+        name: (unit, widen(figure, per_k.get(name, TYPICAL_PER_K), warmer_k))
         for name, (unit, figure) in own.items()
     }
     if conditions.cause in ("zero", "open"):
@@ -314,13 +320,13 @@ def _of_damper(
 
 
 def _standard_deviation(figure: Figure) -> float:
-    return max(0.5 * (figure.high - figure.low) / _STDS, 1e-12)
+    return max(figure.half / _STDS, 1e-12)
 
 
 def _difference(second: Figure, first: Figure) -> Figure:
     value = second.value - first.value
     half = _STDS * math.hypot(_standard_deviation(second), _standard_deviation(first))
-    return Figure(value, value - half, value + half, second.method)
+    return Figure.around(value, half, second.method)
 
 
 def _holm_procedure(figures: Sequence[Figure]) -> list[bool]:

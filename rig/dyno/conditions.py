@@ -25,20 +25,20 @@ _STDS = 1.96
 _NO_MATTER_K, _FAR_K = 0.3, 2.0
 """Differences of temperature that are not noticed, and beyond which an unknown change matters."""
 
-_TYPICAL_PER_K = 0.004
+TYPICAL_PER_K = 0.004
 """Relative change of a damping force per kelvin that is assumed possible where it is not known."""
 
-_FRICTION_PER_K = 0.01
+FRICTION_PER_K = 0.01
 """The same of friction: seals soften as they warm."""
 
-_GAS_PER_K = 1.0 / 273.0
+GAS_PER_K = 1.0 / 273.0
 """The same of a gas force: ideal gas of constant volume."""
 
 _CERTAIN = 3.0
 """Standard deviations from which on a shift of all forces is one."""
 
 
-class Conditions(NamedTuple):
+class RecordConditions(NamedTuple):
     """What differs between a first and a second record.
 
     Attributes:
@@ -59,16 +59,16 @@ class Conditions(NamedTuple):
         value, more = figure.value, 0.0
         if self.shift is not None:
             value -= self.shift.value
-            more = _half(self.shift)
+            more = self.shift.half
         damping_n = value - self.gas_n
         if abs(apart_k) < _NO_MATTER_K:
             return _with(figure, value, more)
         if share is None:
             if abs(apart_k) > _FAR_K:
                 return None
-            return _with(figure, value, more, damping_n * _TYPICAL_PER_K * apart_k)
+            return _with(figure, value, more, damping_n * TYPICAL_PER_K * apart_k)
         warmed_n = damping_n / (1.0 + share.value * apart_k)
-        return _with(figure, self.gas_n + warmed_n, more, damping_n * _half(share) * apart_k)
+        return _with(figure, self.gas_n + warmed_n, more, damping_n * share.half * apart_k)
 
     def energy(self, figure: Figure, apart_k: float) -> Figure | None:
         """An energy of the second record as it would be in the first one; None if unknown."""
@@ -78,41 +78,29 @@ class Conditions(NamedTuple):
         if down is None or up is None:
             if abs(apart_k) > _FAR_K:
                 return None
-            return _with(figure, figure.value, figure.value * _TYPICAL_PER_K * apart_k)
+            return _with(figure, figure.value, figure.value * TYPICAL_PER_K * apart_k)
         share = 0.5 * (down.value + up.value)
         # Each direction has its part in the energy, which is not known here.
-        half = 0.5 * abs(down.value - up.value) + max(_half(down), _half(up))
+        half = 0.5 * abs(down.value - up.value) + max(down.half, up.half)
         value = figure.value / (1.0 + share * apart_k)
-        return _with(figure, value, figure.value * (half + 0.1 * _FRICTION_PER_K) * apart_k)
-
-    def wider(self, figure: Figure, per_k: float, apart_k: float) -> Figure:
-        """A figure whose interval contains a relative change per kelvin."""
-        return _with(figure, figure.value, figure.value * per_k * apart_k)
-
-    def gas(self, figure: Figure, apart_k: float) -> Figure:
-        """A gas force or rate, whose interval contains what temperature changes in it."""
-        return self.wider(figure, _GAS_PER_K, apart_k)
-
-    def friction(self, figure: Figure, apart_k: float) -> Figure:
-        """A friction force, whose interval contains what temperature changes in it."""
-        return self.wider(figure, _FRICTION_PER_K, apart_k)
-
-    def damping(self, figure: Figure, apart_k: float) -> Figure:
-        """A figure of the damping, whose interval contains what temperature may change in it."""
-        return self.wider(figure, _TYPICAL_PER_K, apart_k)
+        return _with(figure, value, figure.value * (half + 0.1 * FRICTION_PER_K) * apart_k)
 
 
-def find_conditions(before: Characteristics, after: Characteristics) -> Conditions:
+def widen(figure: Figure, per_k: float, apart_k: float) -> Figure:
+    """A figure whose interval contains a relative change per kelvin."""
+    return _with(figure, figure.value, figure.value * per_k * apart_k)
+
+
+def find_conditions(before: Characteristics, after: Characteristics) -> RecordConditions:
     """What differs between two records beside the damper."""
     shares = tuple(_share(before, after, side) for side in SIDES)
     first, second = before.damper.gas_force_n, after.damper.gas_force_n
     gas_n = 0.0 if first is None else first.value
     if first is None or second is None:
-        return Conditions((shares[0], shares[1]), gas_n, None, "")
-    half = math.hypot(_half(first), _half(second))
-    value = second.value - first.value
-    shift = Figure(value, value - half, value + half, "gas force of the slowest steps")
-    return Conditions((shares[0], shares[1]), gas_n, shift, _cause(before, after, shift))
+        return RecordConditions((shares[0], shares[1]), gas_n, None, "")
+    half = math.hypot(first.half, second.half)
+    shift = Figure.around(second.value - first.value, half, "gas force of the slowest steps")
+    return RecordConditions((shares[0], shares[1]), gas_n, shift, _cause(before, after, shift))
 
 
 def apart_k(first: DynoStep | None, second: DynoStep | None) -> float:
@@ -138,41 +126,32 @@ def _share(before: Characteristics, after: Characteristics, side: str) -> Figure
     ]
     if not known:
         return None
-    weights = [1.0 / max(_half(share), 1e-9) ** 2 for share in known]
+    weights = [1.0 / max(share.half, 1e-9) ** 2 for share in known]
     value = sum(w * share.value for w, share in zip(weights, known, strict=True)) / sum(weights)
     half = sum(weights) ** -0.5
-    return Figure(value, value - half, value + half, known[0].method)
+    return Figure.around(value, half, known[0].method)
 
 
 def _cause(before: Characteristics, after: Characteristics, shift: Figure) -> str:
     """What shifts all forces, by the change of the spring rate."""
-    gas, rates = (
-        before.damper.gas_force_n,
-        (
-            before.damper.gas_rate_n_per_m,
-            after.damper.gas_rate_n_per_m,
-        ),
-    )
-    if abs(shift.value) < _CERTAIN / _STDS * _half(shift):
+    gas = before.damper.gas_force_n
+    first, second = before.damper.gas_rate_n_per_m, after.damper.gas_rate_n_per_m
+    if abs(shift.value) < _CERTAIN / _STDS * shift.half:
         return ""
-    if gas is None or rates[0] is None or rates[1] is None:
+    if gas is None or first is None or second is None:
         return "open"
     apart = abs(apart_k(slowest(before), slowest(after)))
     by_gas = shift.value / gas.value
-    shown = rates[1].value / rates[0].value - 1.0
-    half = math.hypot(_half(rates[0]) / rates[0].value, _half(rates[1]) / rates[0].value)
-    half = math.hypot(half, _GAS_PER_K * apart, abs(by_gas) * _half(gas) / abs(gas.value))
+    shown = second.value / first.value - 1.0
+    half = math.hypot(first.half / first.value, second.half / first.value)
+    half = math.hypot(half, GAS_PER_K * apart, abs(by_gas) * gas.half / abs(gas.value))
     is_gas, is_zero = abs(shown - by_gas) <= half, abs(shown) <= half
     if is_gas == is_zero:
         return "open"
     return "gas" if is_gas else "zero"
 
 
-def _half(figure: Figure) -> float:
-    return 0.5 * (figure.high - figure.low)
-
-
 def _with(figure: Figure, value: float, *more: float) -> Figure:
     """A figure with another value, and further half widths in its interval."""
-    half = math.hypot(_half(figure), *more)
-    return Figure(value, value - half, value + half, figure.method)
+    half = math.hypot(figure.half, *more)
+    return Figure.around(value, half, figure.method)

@@ -9,14 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.dyno.cell_lag import Lag, estimate_lag
-from rig.dyno.figures import DynoStep, ForceRecord
+from rig.dyno.cell_lag import CellLag, estimate_lag
+from rig.dyno.figures import LOAD_CELL, DynoStep, ForceRecord
 from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import Array
 from rig.dyno.zero_drift import ZeroDrift
-
-LOAD_CELL = "load cell"
-"""Source of a force whose lag is one time: that of an observer depends on the frequency."""
 
 _LEAST_LAG_S, _LONGEST_LAG_S = 1e-4, 2e-2
 """Lags that are worth removing, and beyond which two channels do not belong together."""
@@ -25,8 +22,8 @@ _KNOWN_SHARE, _KNOWN_S = 0.25, 3e-4
 """Half of its interval, as a share of a lag and as a time, up to which a lag is known."""
 
 
-class WantedCorrections(NamedTuple):
-    """Corrections that a user wants.
+class RequestedCorrections(NamedTuple):
+    """Corrections that a user requests.
 
     Attributes:
         zero: Whether a drift of the zero is removed.
@@ -39,7 +36,7 @@ class WantedCorrections(NamedTuple):
     lag_s: float | None = None
 
 
-ALL_CORRECTIONS = WantedCorrections()
+ALL_CORRECTIONS = RequestedCorrections()
 
 
 class Corrections(NamedTuple):
@@ -54,7 +51,7 @@ class Corrections(NamedTuple):
 
     drift: ZeroDrift | None
     removes_drift: bool
-    lag: Lag | None
+    lag: CellLag | None
     removed_lag_s: float
 
     @property
@@ -115,6 +112,9 @@ class Corrections(NamedTuple):
         return f" (95 %: {low:.3g} to {high:.3g} ms)"
 
 
+NO_CORRECTIONS = Corrections(None, False, None, 0.0)
+
+
 def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
     change = (
         f"the zero of the load cell drifted by {drift.largest.value:+.3g} N between "
@@ -131,23 +131,23 @@ def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
     )
 
 
-def _is_seen(lag: Lag) -> bool:
+def _is_seen(lag: CellLag) -> bool:
     """Whether a lag is certain and of a size that matters."""
     figure = lag.figure
     is_certain = figure.low > 0.0 or figure.high < 0.0
     return is_certain and abs(figure.value) >= _LEAST_LAG_S
 
 
-def _is_known(lag: Lag) -> bool:
+def _is_known(lag: CellLag) -> bool:
     """Whether a lag is one time, and known well enough to be removed."""
-    half = 0.5 * (lag.figure.high - lag.figure.low)
+    half = lag.figure.half
     size = abs(lag.figure.value)
     is_narrow = math.isfinite(half) and half <= max(_KNOWN_SHARE * size, _KNOWN_S)
     return lag.is_one and is_narrow and _is_seen(lag) and size <= _LONGEST_LAG_S
 
 
 def decide(
-    wanted: WantedCorrections,
+    requested: RequestedCorrections,
     record: ForceRecord,
     steps: Sequence[DynoStep],
     drift: ZeroDrift | None,
@@ -155,12 +155,9 @@ def decide(
     """What is removed from a record, whose steps were computed without it."""
     lag = estimate_lag(steps) if steps and record.source == LOAD_CELL else None
     lag_s = 0.0
-    if wanted.lag and wanted.lag_s is not None:
-        lag_s = wanted.lag_s
-    elif wanted.lag and lag is not None and _is_known(lag):
+    if requested.lag and requested.lag_s is not None:
+        lag_s = requested.lag_s
+    elif requested.lag and lag is not None and _is_known(lag):
         lag_s = lag.figure.value
-    removes = wanted.zero and drift is not None and drift.is_known
+    removes = requested.zero and drift is not None and drift.is_known
     return Corrections(drift, removes, lag, lag_s)
-
-
-NO_CORRECTIONS = Corrections(None, False, None, 0.0)

@@ -153,8 +153,8 @@ def _slopes_at_no_speed(
             ]
             apart = slow.peak_speed_m_per_s - slowest.peak_speed_m_per_s
             value = abs(figures[1].value - figures[0].value) / apart
-            half = 0.5 * sum(it.high - it.low for it in figures) / apart
-            found.append(Figure(value, value - half, value + half, "slope to the next step"))
+            half = sum(it.half for it in figures) / apart
+            found.append(Figure.around(value, half, "slope to the next step"))
     is_known = len(found) == len(SIDES) and all(it.is_bounded for it in found)
     return (found[0], found[1]) if is_known else None
 
@@ -176,7 +176,7 @@ def _at_no_speed(
     if slopes is None or gas is None or friction is None:
         return gas, rate, friction
     down, up = slopes
-    half = 0.25 * speed * (down.high - down.low + up.high - up.low)
+    half = 0.5 * speed * (down.half + up.half)
     return (
         _less(gas, 0.5 * speed * (down.value - up.value), half),
         rate,
@@ -187,9 +187,9 @@ def _at_no_speed(
 def _less(figure: Figure, bleed_n: float, half_n: float) -> Figure:
     """A figure without the damping at its speed, which is known but for some half width."""
     value = figure.value - bleed_n
-    half = float(np.hypot(0.5 * (figure.high - figure.low), half_n))
+    half = float(np.hypot(figure.half, half_n))
     method = f"{figure.method}, less {bleed_n:.2g} N of damping there"
-    return Figure(value, value - half, value + half, method)
+    return Figure.around(value, half, method)
 
 
 def spring_curve(step: DynoStep) -> np.polynomial.Polynomial:
@@ -231,15 +231,15 @@ def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     if compression <= 0.0 or rebound <= 0.0:
         return None
     ratio = rebound / compression
-    own = 0.0 if gas is None else 0.5 * (gas.high - gas.low)
+    own = 0.0 if gas is None else gas.half
     parts = (
-        0.5 * (up.high - up.low) / rebound,
-        0.5 * (down.high - down.low) / compression,
+        up.half / rebound,
+        down.half / compression,
         own * (1.0 / rebound + 1.0 / compression),
     )
     half = ratio * float(np.linalg.norm(parts))
     of = "whole force" if gas is None else "force less gas force"
-    return Figure(ratio, ratio - half, ratio + half, f"{of} at peak velocity, fastest step")
+    return Figure.around(ratio, half, f"{of} at peak velocity, fastest step")
 
 
 class _Warming(NamedTuple):
@@ -250,9 +250,7 @@ class _Warming(NamedTuple):
 
     def share(self, gas: Figure) -> Figure:
         """The change over the force without gas."""
-        damping_n = self.mean_n - gas.value
-        low, high = sorted((self.slope.low / damping_n, self.slope.high / damping_n))
-        return Figure(self.slope.value / damping_n, low, high, self.slope.method)
+        return self.slope.scaled(1.0 / (self.mean_n - gas.value))
 
 
 def _per_kelvin(steps: Sequence[DynoStep], index: int) -> _Warming | None:
@@ -291,5 +289,5 @@ def _slope(group: Sequence[DynoStep], index: int) -> _Warming | None:
     half = student_factor(freedom) * std
     speed = group[0].peak_speed_m_per_s
     text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
-    figure = Figure(slope, slope - half, slope + half, text)
+    figure = Figure.around(slope, half, text)
     return _Warming(figure, float(forces.mean()))

@@ -64,6 +64,9 @@ _BATCHES = 10
 
 SIDES = ("compression", "rebound")
 
+LOAD_CELL = "load cell"
+"""Source of a force whose lag is one time: that of an observer depends on the frequency."""
+
 
 class ForceRecord(NamedTuple):
     """Measured motion and force of a strut.
@@ -82,7 +85,7 @@ class ForceRecord(NamedTuple):
     force_n: Array
     temperature_c: Array | None = None
     strut: str = ""
-    source: str = "load cell"
+    source: str = LOAD_CELL
 
     def without(self, samples: NDArray[np.bool_]) -> "ForceRecord":
         """The record without some samples, shape (N,)."""
@@ -172,19 +175,26 @@ class DynoStep(NamedTuple):
         )
 
 
-def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoStep | str:
-    """Figures of a block, or why it has none; of a load cell that is clipped at the limits."""
-    t_s, warm_c = record.t_s, record.temperature_c
-    share = max(1, int((block.end - block.begin) / block.cycles / _MOST_A_CYCLE))
-    times_s, heights_m, force_n = (
-        _thinned(values[block.begin : block.end], share)
-        for values in (t_s, record.height_m, record.force_n)
-    )
-    warm_c = None if warm_c is None else _thinned(warm_c[block.begin : block.end], share)
+def find_motion(record: ForceRecord, block: Block) -> BlockMotion | None:
+    """The motion that a block repeats; None if it repeats none."""
+    times_s, heights_m = _thin(record.t_s, block), _thin(record.height_m, block)
     motion = fit_motion(times_s, heights_m, round(2.0 * block.cycles))
-    if motion is None or (
-        np.isnan(motion.period_s) and not is_repetition(t_s, record.height_m, block)
-    ):
+    if motion is None or not np.isnan(motion.period_s):
+        return motion
+    return motion if is_repetition(record.t_s, record.height_m, block) else None
+
+
+def compute_step(
+    record: ForceRecord, block: Block, motion: BlockMotion | None, limits: ForceRange
+) -> DynoStep | str:
+    """Figures of a block and its motion, or why it has none.
+
+    The load cell is clipped at the limits.
+    """
+    t_s, warm_c = record.t_s, record.temperature_c
+    force_n = _thin(record.force_n, block)
+    warm_c = None if warm_c is None else _thin(warm_c, block)
+    if motion is None:
         return f"{len(block.strokes)} strokes of one amplitude that do not repeat one motion"
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
@@ -216,10 +226,12 @@ def compute_step(record: ForceRecord, block: Block, limits: ForceRange) -> DynoS
     )
 
 
-def _thinned(values: Array, share: int) -> Array:
-    """Means of some samples in a row, shape (N / share,)."""
-    kept = len(values) // share * share
-    return np.asarray(values[:kept].reshape(-1, share).mean(axis=1), np.float64)
+def _thin(values: Array, block: Block) -> Array:
+    """A channel (N,) of a record in a block, as means of some samples in a row if it has many."""
+    share = max(1, int((block.end - block.begin) / block.cycles / _MOST_A_CYCLE))
+    kept = (block.end - block.begin) // share * share
+    inside = values[block.begin : block.begin + kept]
+    return np.asarray(inside.reshape(-1, share).mean(axis=1), np.float64)
 
 
 def compute_rest(record: ForceRecord, here: slice) -> AtRest:
@@ -234,7 +246,7 @@ def compute_rest(record: ForceRecord, here: slice) -> AtRest:
         float(record.t_s[here][0]),
         float(record.t_s[here][-1]),
         float(record.height_m[here].mean()),
-        Figure(mean, mean - half, mean + half, "mean at rest, ten batches"),
+        Figure.around(mean, half, "mean at rest, ten batches"),
         None if warm_c is None else float(warm_c[here].mean()),
     )
 
@@ -278,7 +290,7 @@ def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float
     against = int(np.argmax(-stroke.sign * stroke.force_n))
     half = 1.96 * speed_std
     return Side(
-        Figure(peak, peak - half, peak + half, method),
+        Figure.around(peak, half, method),
         stroke.figure(row, what),
         stroke.figure(
             stroke.row(middle).mean(axis=0), f"window of {100 * _WINDOW:.0f} % about mid-stroke"

@@ -134,7 +134,7 @@ def _fit(design: Array, target: Array) -> tuple[Array, float]:
 def _slope(row: Array, weights: Array, covariance: Array, *, sign: int) -> Figure:
     """A slope, positive for a damper."""
     value, half = -sign * float(row @ weights), 1.96 * float(np.sqrt(row @ covariance @ row))
-    return Figure(value, value - half, value + half, "line on its side of the knee")
+    return Figure.around(value, half, "line on its side of the knee")
 
 
 def _points(

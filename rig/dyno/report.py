@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics, characterise
-from rig.dyno.corrections import ALL_CORRECTIONS, WantedCorrections
+from rig.dyno.corrections import ALL_CORRECTIONS, RequestedCorrections
 from rig.dyno.faults import MasterComparison, name_faults
 from rig.dyno.master import master_of
 from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
@@ -80,7 +80,7 @@ def evaluate_records(
     band: ToleranceBand | None,
     master: Path | None,
     scatter: float,
-    wanted: WantedCorrections = ALL_CORRECTIONS,
+    requested: RequestedCorrections = ALL_CORRECTIONS,
 ) -> list[DamperReport]:
     """Reports of several records, folders of runs or CSV files, against a band and a master.
 
@@ -93,10 +93,10 @@ def evaluate_records(
     """
     if master is not None and any(path.resolve() == master.resolve() for path in paths):
         raise InputError(f"--master {master}: is the record itself, expected that of a good damper")
-    good = None if master is None else characterise(master, strut, wanted)
+    good = None if master is None else characterise(master, strut, requested)
     if good is not None:
-        wanted = wanted._replace(lag_s=good.corrections.removed_lag_s)
-    records = [characterise(path, strut, wanted) for path in paths]
+        requested = requested._replace(lag_s=good.corrections.removed_lag_s)
+    records = [characterise(path, strut, requested) for path in paths]
     model = None if good is None else master_of(good)
     return [
         DamperReport(

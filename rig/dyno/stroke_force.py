@@ -71,6 +71,21 @@ class Figure(NamedTuple):
     high: float
     method: str
 
+    @classmethod
+    def around(cls, value: float, half: float, method: str) -> "Figure":
+        """A figure in the middle of its interval, of which `half` is half the width."""
+        return cls(value, value - half, value + half, method)
+
+    def scaled(self, factor: float) -> "Figure":
+        """The figure times a factor, which may be negative."""
+        low, high = sorted((factor * self.low, factor * self.high))
+        return self._replace(value=factor * self.value, low=low, high=high)
+
+    @property
+    def half(self) -> float:
+        """Half the width of its interval."""
+        return 0.5 * (self.high - self.low)
+
     @property
     def is_bounded(self) -> bool:
         """Whether both ends of its interval are known."""

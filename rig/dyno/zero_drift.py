@@ -131,7 +131,7 @@ def _fit(rests: Sequence[AtRest], cycles: Sequence[_Cycles]) -> ZeroDrift | None
     """The polynomial of least degree that describes them; None where they determine none."""
     rest_s = np.array([0.5 * (rest.begin_s + rest.end_s) for rest in rests])
     force_n = np.array([rest.force_n.value for rest in rests])
-    rest_std_n = np.array([0.51 * 0.5 * (it.force_n.high - it.force_n.low) for it in rests])
+    rest_std_n = np.array([0.51 * it.force_n.half for it in rests])
     first_s, last_s, change_n, std_n = (
         np.array([it[i] for it in cycles]) for i in range(len(_Cycles._fields))
     )
@@ -167,12 +167,12 @@ def _fit(rests: Sequence[AtRest], cycles: Sequence[_Cycles]) -> ZeroDrift | None
     at = int(np.argmax(np.abs(drift_n)))
     value = float(drift_n[at])
     half = 1.96 * float(shares[at] @ covariance @ shares[at]) ** 0.5
-    figure = Figure(value, value - half, value + half, f"polynomial of degree {degree} over time")
+    figure = Figure.around(value, half, f"polynomial of degree {degree} over time")
     return ZeroDrift(line, begin_s, end_s, figure, is_known=True, source="rests at one height")
 
 
 def _is_seen(drift: ZeroDrift) -> bool:
-    half = 0.5 * (drift.largest.high - drift.largest.low)
+    half = drift.largest.half
     return abs(drift.largest.value) > _CERTAIN / 1.96 * half
 
 

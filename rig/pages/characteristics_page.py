@@ -255,7 +255,7 @@ def with_half(figure: Figure) -> str:
     A figure with one end is a bound; one without ends is missing.
     """
     if figure.is_bounded:
-        return plus_minus(figure.value, 0.5 * (figure.high - figure.low))
+        return plus_minus(figure.value, figure.half)
     bound = next((end for end in (figure.low, figure.high) if math.isfinite(end)), math.nan)
     if math.isnan(bound):
         return _MISSING

@@ -7,7 +7,6 @@ from typing import NamedTuple
 from rig.dyno.characterise import Characteristics
 from rig.dyno.comparison import Difference, Match, Trend, list_not_comparable, pair_steps
 from rig.dyno.report import DamperReport
-from rig.dyno.stroke_force import Figure
 from rig.pages.characteristics_page import SIGNS, signed, text_of
 from rig.pages.damper_pictures import draw_damper
 from rig.pages.html import render_report, write_page
@@ -121,7 +120,7 @@ def match_table(matches: Sequence[Match], left: str, right: str) -> ComparisonTa
             (
                 text_of(item.left, "N"),
                 text_of(item.right, "N"),
-                signed(_percent(item.share), "%"),
+                signed(item.share.scaled(100.0), "%"),
             ),
         )
         for item in matches
@@ -129,10 +128,6 @@ def match_table(matches: Sequence[Match], left: str, right: str) -> ComparisonTa
     largest = max((abs(item.share.value) for item in matches), default=0.0)
     title = f"Match: at most {100.0 * largest:.0f} % of the band apart"
     return ComparisonTable(title, ("Point", left, right, "Difference over the band"), rows)
-
-
-def _percent(share: Figure) -> Figure:
-    return Figure(100.0 * share.value, 100.0 * share.low, 100.0 * share.high, share.method)
 
 
 def _trend_table(title: str, trends: Sequence[Trend]) -> ComparisonTable:

@@ -8,7 +8,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import characterise_record
-from rig.dyno.corrections import WantedCorrections
+from rig.dyno.corrections import RequestedCorrections
 from rig.dyno.figures import ForceRecord
 from tests.dyno import days
 from tests.dyno.days import Step
@@ -19,9 +19,9 @@ def usual(**changes):
     return days.usual(rate_hz=500.0, **changes)
 
 
-def characterised(day, wanted=None, seed=1):
+def characterised(day, requested=None, seed=1):
     record = ForceRecord("day", *day.record(seed))
-    return characterise_record(record, *([] if wanted is None else [wanted]))
+    return characterise_record(record, *([] if requested is None else [requested]))
 
 
 def at_peak(step):
@@ -96,7 +96,7 @@ def test_a_lag_of_the_cell_is_found_and_removed(lag_s):
     assert_right(found, day, wider_n=0.5)
     rates = [step.spring_rate_n_per_m for step in found.steps]
     assert max(rate.value for rate in rates) < 1.01 * min(rate.value for rate in rates)
-    kept = characterised(day, WantedCorrections(lag=False))
+    kept = characterised(day, RequestedCorrections(lag=False))
     assert kept.corrections.removed_lag_s == 0.0
     assert "not removed" in " ".join(kept.quality)
     shown = [step.spring_rate_n_per_m.value for step in kept.steps]
@@ -125,7 +125,7 @@ def test_a_drift_of_the_zero_is_removed(drift_n, lag_s):
     assert found.corrections.drift.largest.value == pytest.approx(drift_n, rel=0.05)
     # What the zero is at the first rest is not known.
     assert_right(found, day, wider_n=0.01 * abs(drift_n))
-    kept = characterised(day, WantedCorrections(zero=False))
+    kept = characterised(day, RequestedCorrections(zero=False))
     assert not kept.corrections.removes_drift
     assert ": not removed" in " ".join(kept.quality)
 
