@@ -12,7 +12,7 @@ from rig.cli.terminal import (
     FAILED,
     JsonFlag,
     Labels,
-    LagFlag,
+    LagGiven,
     PrintToo,
     StrutOfRun,
     ZeroFlag,
@@ -63,7 +63,7 @@ def characterise_command(
     ],
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
-    lag: LagFlag = True,
+    lag_ms: LagGiven = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for characteristics.json and report.html."),
@@ -100,7 +100,7 @@ def characterise_command(
     if junit is not None and tolerance is None and master is None:
         raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    requested = RequestedCorrections(zero, lag)
+    requested = RequestedCorrections(zero, None if lag_ms is None else 1e-3 * lag_ms)
     reports = evaluate_records(runs, strut, band, master, scatter, requested)
     content = content_of(reports, serial, band)
     if out is not None:

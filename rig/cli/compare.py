@@ -10,7 +10,7 @@ from can_dbc.errors import InputError
 from rig.cli.terminal import (
     JsonFlag,
     Labels,
-    LagFlag,
+    LagGiven,
     StrutOfRun,
     ZeroFlag,
     print_json,
@@ -43,7 +43,7 @@ def compare_command(
     ] = None,
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
-    lag: LagFlag = True,
+    lag_ms: LagGiven = None,
     tolerance: Annotated[
         Path | None,
         typer.Option(
@@ -88,7 +88,7 @@ def compare_command(
         refuse_full(out)
     band = None if tolerance is None else load_tolerance(tolerance)
     labels = parse_labels(label or [])
-    requested = RequestedCorrections(zero, lag)
+    requested = RequestedCorrections(zero, None if lag_ms is None else 1e-3 * lag_ms)
     records = [characterise(path, strut, requested) for path in runs]
     content: dict[str, object] = {"schema": 1}
     if dose:

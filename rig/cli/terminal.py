@@ -39,11 +39,15 @@ ZeroFlag = Annotated[
         help="Remove a drift of the load cell's zero, where rests and cycles show one.",
     ),
 ]
-LagFlag = Annotated[
-    bool,
+LagGiven = Annotated[
+    float | None,
     typer.Option(
-        "--lag/--no-lag",
-        help="Remove the time by which the force lags the height, where the steps show one.",
+        "--lag-ms",
+        metavar="MS",
+        min=-20.0,
+        max=20.0,
+        help="Time by which the force lags the height, which is removed; 0 if it does not. Without "
+        "it, the lag is estimated from the steps.",
     ),
 ]
 Labels = Annotated[

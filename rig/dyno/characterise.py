@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from can_dbc.errors import InputError, expected_name
+from rig.dyno.alternatives import cover
 from rig.dyno.corrections import (
     ALL_CORRECTIONS,
     NO_CORRECTIONS,
@@ -27,7 +28,15 @@ from rig.dyno.figures import (
 from rig.dyno.quality import quality
 from rig.dyno.sensor_faults import find_level_limits, judge_sensors
 from rig.dyno.stroke_force import ForceRange
-from rig.dyno.strokes import Array, Block, BlockMotion, find_blocks, find_holds, find_strokes
+from rig.dyno.strokes import (
+    Array,
+    Block,
+    BlockMotion,
+    find_blocks,
+    find_holds,
+    find_slow_cycle,
+    find_strokes,
+)
 from rig.dyno.timeline import Span, account
 from rig.dyno.zero_drift import estimate_drift
 from rig.log.reader import read_run
@@ -120,7 +129,7 @@ def characterise_record(
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(t_s, height_m, strokes)
     rests = find_holds(t_s, height_m, blocks)
-    moving = [(block, find_motion(record, block)) for block in blocks]
+    moving = [_find_moving(record, block) for block in blocks]
     kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
     levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
     if levels != ForceRange():
@@ -141,8 +150,24 @@ def characterise_record(
     marked = mark_warm_up([step for _, step in kept])
     spans = account(t_s, strokes, [block for block, _ in kept], rejected, rests)
     warnings = quality(record, marked, spans, faults, corrections)
-    damper = summarise_damper(marked)
-    return Characteristics(record, marked, holds, damper, corrections, warnings, spans)
+    others = [
+        (other, tuple(other.apply(step) for step in marked)) for other in corrections.alternatives()
+    ]
+    damper = cover(
+        summarise_damper(marked), [(other, summarise_damper(steps)) for other, steps in others]
+    )
+    steps = cover(marked, others)
+    return Characteristics(record, steps, holds, damper, corrections, warnings, spans)
+
+
+def _find_moving(record: ForceRecord, block: Block) -> tuple[Block, BlockMotion | None]:
+    """A block with the motion that it repeats, or that of its one slow cycle."""
+    motion = find_motion(record, block)
+    if motion is None and len(block.strokes) > 1:
+        cycle = find_slow_cycle(record.t_s, record.height_m, block)
+        if cycle is not None and (slow := find_motion(record, cycle)) is not None:
+            return cycle, slow
+    return block, motion
 
 
 def _compute_steps(

@@ -18,19 +18,11 @@ from scipy.special import ndtr  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.conditions import (
-    FRICTION_PER_K,
-    GAS_PER_K,
-    TYPICAL_PER_K,
-    RecordConditions,
-    apart_k,
-    find_conditions,
-    slowest,
-    widen,
-)
+from rig.dyno.conditions import RecordConditions, find_conditions, slowest
 from rig.dyno.damper import FRICTION, GAS, GAS_RATE
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure, student_factor
+from rig.dyno.temperature import FRICTION_PER_K, GAS_PER_K, TYPICAL_PER_K, apart_k, widen
 from rig.dyno.tolerance import ToleranceBand, evaluate_band
 
 _ALIKE = 0.1

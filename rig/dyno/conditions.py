@@ -18,21 +18,13 @@ from typing import NamedTuple
 from rig.dyno.characterise import Characteristics
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure
+from rig.dyno.temperature import FRICTION_PER_K, GAS_PER_K, TYPICAL_PER_K, apart_k
 
 _STDS = 1.96
 """Standard deviations of half an interval."""
 
 _NO_MATTER_K, _FAR_K = 0.3, 2.0
 """Differences of temperature that are not noticed, and beyond which an unknown change matters."""
-
-TYPICAL_PER_K = 0.004
-"""Relative change of a damping force per kelvin that is assumed possible where it is not known."""
-
-FRICTION_PER_K = 0.01
-"""The same of friction: seals soften as they warm."""
-
-GAS_PER_K = 1.0 / 273.0
-"""The same of a gas force: ideal gas of constant volume."""
 
 _CERTAIN = 3.0
 """Standard deviations from which on a shift of all forces is one."""
@@ -86,11 +78,6 @@ class RecordConditions(NamedTuple):
         return _with(figure, value, figure.value * (half + 0.1 * FRICTION_PER_K) * apart_k)
 
 
-def widen(figure: Figure, per_k: float, apart_k: float) -> Figure:
-    """A figure whose interval contains a relative change per kelvin."""
-    return _with(figure, figure.value, figure.value * per_k * apart_k)
-
-
 def find_conditions(before: Characteristics, after: Characteristics) -> RecordConditions:
     """What differs between two records beside the damper."""
     shares = tuple(_share(before, after, side) for side in SIDES)
@@ -101,15 +88,6 @@ def find_conditions(before: Characteristics, after: Characteristics) -> RecordCo
     half = math.hypot(first.half, second.half)
     shift = Figure.around(second.value - first.value, half, "gas force of the slowest steps")
     return RecordConditions((shares[0], shares[1]), gas_n, shift, _cause(before, after, shift))
-
-
-def apart_k(first: DynoStep | None, second: DynoStep | None) -> float:
-    """How much warmer the second step is; zero where that is not known."""
-    if first is None or second is None:
-        return 0.0
-    if first.temperature_c is None or second.temperature_c is None:
-        return 0.0
-    return second.temperature_c - first.temperature_c
 
 
 def slowest(record: Characteristics) -> DynoStep:

@@ -7,16 +7,17 @@ import numpy as np
 
 from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.knee import Knee, find_knee
-from rig.dyno.stroke_force import ANGLES, Figure, student_factor
-
-_ALIKE_SPEED = 0.05
-"""Relative difference of speed and amplitude up to which steps are repetitions of each other."""
+from rig.dyno.stroke_force import ANGLES, Figure
+from rig.dyno.temperature import (
+    LEAST_WARMING_K,
+    TYPICAL_PER_K,
+    apart_k,
+    change_per_kelvin,
+    widen,
+)
 
 _SLOW_M_PER_S = 0.06
 """Speed of a step up to which the damping from no speed on may be a straight line."""
-
-_LEAST_WARMING_K = 2.0
-"""Least span of temperatures for a change per kelvin: sensors agree within one kelvin."""
 
 _WARM_UP = 2.0
 """Ratio of the first step's cycles to those of the others, from which it is a warm-up."""
@@ -25,10 +26,6 @@ _SPRING_DEGREE, _INNER = 4, 0.95
 """Of the polynomial in the height that is the spring, and share of the stroke that it is fitted to:
 at the turning points friction reverses. With a degree of 3 the bend of a gas column of twice the
 stroke is taken for damping (3 N of 220 N), with 4 nothing is (0.1 N), with 6 noise is (12 N)."""
-
-_FEWEST_STROKES = 6
-"""Fewest strokes for a change per kelvin."""
-
 
 GAS, GAS_RATE, FRICTION = "gas force", "gas spring rate", "friction"
 """Names of properties of a damper."""
@@ -80,11 +77,7 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     usual = [step for step in steps if step.kind != "warm_up"] or steps
     spring = None if slowest is None else spring_curve(slowest)
     strokes = {name: [step.strokes[index] for step in usual] for index, name in enumerate(SIDES)}
-    moving = {
-        name: [step.strokes[index] for step in usual if step.kind != "quasi_static"]
-        for index, name in enumerate(SIDES)
-    }
-    knee = {name: find_knee(mine, spring) for name, mine in moving.items()}
+    knee = {name: find_knee(mine, spring) for name, mine in strokes.items()}
     clipped = [name for name, mine in strokes.items() if any(it.is_clipped for it in mine)]
     if clipped:
         notes.append(
@@ -107,12 +100,12 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
         if slopes is None:
             speed = 1e3 * slowest.peak_speed_m_per_s
             notes.append(
-                f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in "
-                "them, and their intervals are of the measurement alone"
+                f"friction and gas force are those at {speed:.2g} mm/s, with what bleeds there: it "
+                "is not known, as no other step is slow"
             )
-    warming = {name: _per_kelvin(steps, index) for index, name in enumerate(SIDES)}
+    warming = {name: change_per_kelvin(steps, index) for index, name in enumerate(SIDES)}
     if not any(warming.values()):
-        notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
+        notes.append(f"no change per kelvin: no speed was run over {LEAST_WARMING_K:g} K or more")
     return Damper(
         gas_force,
         gas_rate,
@@ -155,8 +148,11 @@ def _slopes_at_no_speed(
             value = abs(figures[1].value - figures[0].value) / apart
             half = sum(it.half for it in figures) / apart
             found.append(Figure.around(value, half, "slope to the next step"))
-    is_known = len(found) == len(SIDES) and all(it.is_bounded for it in found)
-    return (found[0], found[1]) if is_known else None
+    if len(found) < len(SIDES) or not all(it.is_bounded for it in found):
+        return None
+    warmer_k = max(abs(apart_k(slowest, step)) for step in steps)
+    down, up = (widen(it, TYPICAL_PER_K, warmer_k) for it in found)
+    return down, up
 
 
 def _at_no_speed(
@@ -240,54 +236,3 @@ def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     half = ratio * float(np.linalg.norm(parts))
     of = "whole force" if gas is None else "force less gas force"
     return Figure.around(ratio, half, f"{of} at peak velocity, fastest step")
-
-
-class _Warming(NamedTuple):
-    """Change of a force per kelvin, and the mean of the forces that it is of."""
-
-    slope: Figure
-    mean_n: float
-
-    def share(self, gas: Figure) -> Figure:
-        """The change over the force without gas."""
-        return self.slope.scaled(1.0 / (self.mean_n - gas.value))
-
-
-def _per_kelvin(steps: Sequence[DynoStep], index: int) -> _Warming | None:
-    """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
-    if any(step.temperature_c is None for step in steps):
-        return None
-    groups: list[list[DynoStep]] = []
-    for step in steps:
-        alike = next((group for group in groups if _is_same_step(group[0], step)), None)
-        if alike is None:
-            groups.append([step])
-        else:
-            alike.append(step)
-    found = [slope for group in groups if (slope := _slope(group, index)) is not None]
-    return min(found, key=lambda it: it.slope.high - it.slope.low, default=None)
-
-
-def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
-    return all(
-        abs(x - y) <= _ALIKE_SPEED * x
-        for x, y in ((a.peak_speed_m_per_s, b.peak_speed_m_per_s), (a.amplitude_m, b.amplitude_m))
-    )
-
-
-def _slope(group: Sequence[DynoStep], index: int) -> _Warming | None:
-    """Least squares through the strokes of like steps."""
-    temperatures = np.concatenate([step.warmth[index][0] for step in group])
-    forces = np.concatenate([step.warmth[index][1] for step in group])
-    if len(forces) < _FEWEST_STROKES or np.ptp(temperatures) < _LEAST_WARMING_K:
-        return None
-    about = temperatures - temperatures.mean()
-    slope = float(about @ forces) / float(about @ about)
-    residual = forces - forces.mean() - slope * about
-    freedom = len(forces) - 2
-    std = float(np.sqrt(residual @ residual / freedom / (about @ about)))
-    half = student_factor(freedom) * std
-    speed = group[0].peak_speed_m_per_s
-    text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
-    figure = Figure.around(slope, half, text)
-    return _Warming(figure, float(forces.mean()))

@@ -22,7 +22,7 @@ coupled model for automotive shock absorbers, Vehicle System Dynamics 37 (2002).
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,14 @@ class AtRest(NamedTuple):
     temperature_c: float | None
 
 
+class StrokeWarmth(NamedTuple):
+    """Of each stroke of one direction its temperature, force about mid-stroke, and time."""
+
+    temperature_c: Array
+    force_n: Array
+    t_s: Array
+
+
 class DynoStep(NamedTuple):
     """Figures of a block, one step of a test, as the module describes them.
 
@@ -140,7 +148,8 @@ class DynoStep(NamedTuple):
         half_difference_n: Half of compression less rebound at mid-stroke: the friction where it is
             slow.
         strokes: The mean strokes, compression and rebound.
-        warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
+        warmth: Each stroke, compression and rebound; none where no temperature was measured.
+        velocity_std_m_per_s: Standard deviation of the peak velocities.
     """
 
     kind: str
@@ -160,12 +169,27 @@ class DynoStep(NamedTuple):
     half_difference_n: Figure
     hysteresis_at_zero_n: Figure
     strokes: tuple[MeanStroke, MeanStroke]
-    warmth: tuple[tuple[Array, Array], tuple[Array, Array]]
+    warmth: tuple[StrokeWarmth, StrokeWarmth]
+    velocity_std_m_per_s: float
 
     def figures(self) -> dict[str, object]:
         """All but the arrays, by name."""
-        arrays = ("strokes", "warmth")
-        return {key: value for key, value in self._asdict().items() if key not in arrays}
+        inner = ("strokes", "warmth", "velocity_std_m_per_s")
+        return {key: value for key, value in self._asdict().items() if key not in inner}
+
+    def with_forces(
+        self, strokes: tuple[MeanStroke, MeanStroke], warmth: tuple[StrokeWarmth, StrokeWarmth]
+    ) -> "DynoStep":
+        """The same motion with other forces, compression and rebound."""
+        down, up = strokes
+        std = self.velocity_std_m_per_s
+        return self._replace(
+            compression=_side(down, down, up, std),
+            rebound=_side(up, down, up, std),
+            **_of_both(down, up, std),
+            strokes=strokes,
+            warmth=warmth,
+        )
 
     @property
     def peak_speed_m_per_s(self) -> float:
@@ -203,26 +227,30 @@ def compute_step(
     if down is None or up is None:
         samples = (block.end - block.begin) / block.cycles
         return f"{len(block.strokes)} strokes with {samples:.0f} samples a cycle, which are too few"
-    down, up = down.clipped_at(limits), up.clipped_at(limits)
+    strokes = down.clipped_at(limits), up.clipped_at(limits)
     speed_std = motion.velocity_std_m_per_s
+    times_s = _thin(t_s, block)
+    down, up = strokes
     sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
     speed = max(side.peak_velocity_m_per_s.value for side in sides)
     return DynoStep(
-        "quasi_static" if speed <= _QUASI_STATIC_M_PER_S else "velocity_step",
-        float(t_s[block.begin]),
-        float(t_s[block.end - 1]),
-        block.cycles,
-        None if np.isnan(motion.period_s) else 1.0 / motion.period_s,
-        0.5 * (down.amplitude_m + up.amplitude_m),
-        0.5 * (down.middle_m + up.middle_m),
-        None if warm_c is None else float(np.mean(warm_c)),
-        *sides,
-        *_of_both(down, up, speed_std / float(np.abs(velocity).max())),
-        (down, up),
-        (
-            _warmth(down, motion, force_n, turned, warm_c),
-            _warmth(up, motion, force_n, turned, warm_c),
+        kind="quasi_static" if speed <= _QUASI_STATIC_M_PER_S else "velocity_step",
+        begin_s=float(t_s[block.begin]),
+        end_s=float(t_s[block.end - 1]),
+        cycles=block.cycles,
+        frequency_hz=None if np.isnan(motion.period_s) else 1.0 / motion.period_s,
+        amplitude_m=0.5 * (down.amplitude_m + up.amplitude_m),
+        middle_m=0.5 * (down.middle_m + up.middle_m),
+        temperature_c=None if warm_c is None else float(np.mean(warm_c)),
+        compression=sides[0],
+        rebound=sides[1],
+        **_of_both(down, up, speed_std),
+        strokes=strokes,
+        warmth=(
+            _warmth(down, motion, force_n, turned, warm_c, times_s),
+            _warmth(up, motion, force_n, turned, warm_c, times_s),
         ),
+        velocity_std_m_per_s=speed_std,
     )
 
 
@@ -236,8 +264,9 @@ def _thin(values: Array, block: Block) -> Array:
 
 def compute_rest(record: ForceRecord, here: slice) -> AtRest:
     """Mean height, force and temperature of the samples `here`, at which the strut rests."""
-    # A lag of the cell, and oil that relaxes, last into the rest.
-    settled = slice(here.start + (here.stop - here.start) // _BATCHES, here.stop)
+    # A lag of the cell, and oil that relaxes, last into the rest; one of the height ends it early.
+    edge = (here.stop - here.start) // _BATCHES
+    settled = slice(here.start + edge, here.stop - edge)
     values, warm_c = record.force_n[settled], record.temperature_c
     means = np.array([part.mean() for part in np.array_split(values, min(_BATCHES, len(values)))])
     std = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else float("nan")
@@ -257,21 +286,23 @@ def _warmth(
     force_n: Array,
     number: NDArray[np.int64],
     warm_c: Array | None,
-) -> tuple[Array, Array]:
-    """Temperature of each stroke, and its force about mid-stroke as the mean stroke's and more."""
+    t_s: Array,
+) -> StrokeWarmth:
+    """Strokes of one direction; the force is the mean stroke's and what is more in each."""
     position = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
     central = (np.abs(position) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
     is_clipped = np.any(stroke.beyond[np.abs(np.sin(ANGLES)) < _CENTRAL])
     if warm_c is None or is_clipped or not central.any():
-        return np.empty(0), np.empty(0)
+        return StrokeWarmth(np.empty(0), np.empty(0), np.empty(0))
     more_n = force_n[central] - stroke.row(np.arcsin(position[central])) @ stroke.force_n
     about = np.arcsin(np.linspace(-_CENTRAL, _CENTRAL, 41))
     middle_n = float(np.mean(stroke.row(about) @ stroke.force_n))
     numbers = number[central]
     of_stroke = [numbers == n for n in np.unique(numbers)]
-    return (
+    return StrokeWarmth(
         np.array([warm_c[central][mine].mean() for mine in of_stroke]),
         np.array([middle_n + more_n[mine].mean() for mine in of_stroke]),
+        np.array([t_s[central][mine].mean() for mine in of_stroke]),
     )
 
 
@@ -328,9 +359,19 @@ def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[Array, MeanStroke]]:
     ]
 
 
-def _of_both(
-    down: MeanStroke, up: MeanStroke, relative_std: float
-) -> tuple[Figure, Figure, Figure, Figure, Figure, Figure]:
+class _OfBoth(TypedDict):
+    """Figures of both directions together, by their names in a step."""
+
+    energy_per_cycle_j: Figure
+    equivalent_damping_n_s_per_m: Figure
+    spring_rate_n_per_m: Figure
+    mean_force_n: Figure
+    half_difference_n: Figure
+    hysteresis_at_zero_n: Figure
+
+
+def _of_both(down: MeanStroke, up: MeanStroke, speed_std: float) -> _OfBoth:
+    relative_std = speed_std / max(float(np.abs(it.velocity_m_per_s).max()) for it in (down, up))
     angles = _ANGLE_NODES
     along = _WEIGHT * np.cos(angles)
     work = [
@@ -345,17 +386,17 @@ def _of_both(
     turning_down, turning_up = (
         (item.row(-0.5 * np.pi) + item.row(0.5 * np.pi))[0] for item in (down, up)
     )
-    return (
-        combine(work, "area of the loop", 1.0, relative_std),
-        combine(
-            work, "energy over that of a linear damper of 1 N·s/m", 1.0 / squared, relative_std
+    linear = "energy over that of a linear damper of 1 N·s/m"
+    slope = "slope of the mean of both strokes, inner 90 %"
+    difference = "half the difference of both at mid-stroke"
+    turning = [(turning_down, down), (-turning_up, up)]
+    return {
+        "energy_per_cycle_j": combine(work, "area of the loop", 1.0, relative_std),
+        "equivalent_damping_n_s_per_m": combine(work, linear, 1.0 / squared, relative_std),
+        "spring_rate_n_per_m": combine(_spring(down, up), slope, 1.0, relative_std),
+        "mean_force_n": combine(
+            [(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5
         ),
-        combine(
-            _spring(down, up), "slope of the mean of both strokes, inner 90 %", 1.0, relative_std
-        ),
-        combine([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
-        combine(
-            [(mid_down, down), (-mid_up, up)], "half the difference of both at mid-stroke", 0.5
-        ),
-        combine([(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5),
-    )
+        "half_difference_n": combine([(mid_down, down), (-mid_up, up)], difference, 0.5),
+        "hysteresis_at_zero_n": combine(turning, "difference at the turning points", 0.5),
+    }

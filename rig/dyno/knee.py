@@ -41,7 +41,7 @@ _SLOWEST_M_PER_S, _LEAST_SHARE = 5e-3, 0.5
 """Speed, or share of the largest one if that is slower, below which dry friction that builds up
 over a travel takes part."""
 
-_MISFIT = 0.003
+_MISFIT = 0.005
 """Share of the largest force by which a mean curve may bend between the samples of its strokes."""
 
 _KNEES = 240
@@ -98,6 +98,9 @@ def find_knee(
     if straight - least < _CHANCE * scale or max(below, above) < _STRAIGHT * min(below, above):
         return None
     inside = tried[sums <= least + _QUANTILE * scale]
+    slowest = min(float(np.abs(stroke.velocity_m_per_s).max()) for stroke in strokes)
+    if slowest >= tried[best]:
+        return None
     step = float(tried[1] / tried[0])
     method = f"two straight lines through force over speed, {len(strokes)} steps"
     knee = Figure(

@@ -43,11 +43,6 @@ a bias as large as its noise, and intervals about it miss the truth (Hall, Ann. 
 _VELOCITY_PIECES = (16, 8, 4, 2, 1, 0)
 """Of the mean velocity, which has no noise to speak of."""
 
-_WIDER = 1.2
-"""Of all half widths: a spline that the data chose is known less well than one given beforehand.
-Without it 93 to 96 % of the intervals held the truth over 240 dynos at random
-(`python -m tests.dyno`, seed 1)."""
-
 _WORST_CONDITION = 1e10
 """Of the normal equations: beyond it the samples leave a part of the stroke open."""
 
@@ -245,7 +240,7 @@ def combine(
     # Welch's and Satterthwaite's degrees of freedom of a sum.
     weighted = sum(v * v / stroke.freedom for v, (_, stroke) in zip(variances, parts, strict=True))
     freedom = variance * variance / weighted if weighted > 0.0 else 1e9
-    half = _WIDER * student_factor(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
+    half = student_factor(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
     # Where a force was clipped, the true one moves the sum in one direction or in both.
     moves = np.concatenate([np.sign(factor * row) * stroke.beyond for row, stroke in parts])
     low = -math.inf if np.any(moves < 0.0) else value - half

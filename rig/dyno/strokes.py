@@ -49,6 +49,10 @@ _ODD_SHAPE = 0.03
 """Standard deviation of a stroke's shape from the usual one, as a share of its rise, from which on
 it is another motion: a rest of a tenth of its duration makes 0.04."""
 
+_TURN_SAMPLES = 1.0
+"""Samples by which a turning point may be off: durations differ by twice as much, and of the shape
+as large a share as of the stroke's samples."""
+
 _ODD_NOISE = 3.0
 """Standard deviations of the height's noise that a shape may differ by."""
 
@@ -140,7 +144,7 @@ class Block(NamedTuple):
 
 def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
     """All strokes of a record: times, increasing, and heights, shape (N,)."""
-    noise_m = _noise_m(height_m)
+    noise_m = standard_noise(height_m)
     low, high = np.percentile(height_m, (1.0, 99.0))
     least_m = max(_TURN_SHARE * float(high - low), _TURN_NOISE * noise_m)
     turns = list(_turns(height_m, least_m)) if least_m > 0.0 else []
@@ -150,9 +154,9 @@ def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
     ]
 
 
-def _noise_m(height_m: Array) -> float:
-    """Standard deviation of a height's noise, by its third differences."""
-    return float(np.median(np.abs(np.diff(height_m, 3)))) / (0.6745 * np.sqrt(20.0))
+def standard_noise(values: Array) -> float:
+    """Standard deviation of the noise of a smooth channel, by its third differences."""
+    return float(np.median(np.abs(np.diff(values, 3)))) / (0.6745 * np.sqrt(20.0))
 
 
 def _turns(height_m: Array, least_m: float) -> Iterator[int]:
@@ -224,7 +228,9 @@ def _split_by_shape(t_s: Array, height_m: Array, run: list[Stroke]) -> Iterator[
         )
         apart[side] = np.std(shapes - np.median(shapes, axis=0), axis=1)
     usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
-    largest = max(_ODD_SHAPE, _ODD_NOISE * _noise_m(height_m) / usual_m)
+    samples = (run[-1].last - run[0].first) / len(run)
+    noise = _ODD_NOISE * standard_noise(height_m) / usual_m
+    largest = max(_ODD_SHAPE, _TURN_SAMPLES / samples, noise)
     parts = (run[alike] for alike in find_stretches(apart <= largest))
     yield from (part for part in parts if len(part) >= _FEWEST_STROKES)
 
@@ -234,6 +240,14 @@ def _heights_along(t_s: Array, height_m: Array, stroke: Stroke) -> Array:
     share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
     at_s = t_s[stroke.first] + share * stroke.duration_s
     return np.asarray(np.interp(at_s, t_s, height_m), np.float64)
+
+
+def find_slow_cycle(t_s: Array, height_m: Array, block: Block) -> Block | None:
+    """The cycle about the middle stroke of a block, if it is a slow sine; else None.
+
+    Of a few slow cycles between which the machine builds up its amplitude, one is whole.
+    """
+    return _single_cycle(t_s, height_m, block.strokes[len(block.strokes) // 2])
 
 
 def _single_cycle(t_s: Array, height_m: Array, stroke: Stroke) -> Block | None:
@@ -288,9 +302,11 @@ def _is_alike(run: list[Stroke], stroke: Stroke) -> bool:
     same_size = abs(abs(stroke.rise_m) - abs(last.rise_m)) <= _ALIKE * abs(last.rise_m)
     if not same_size or stroke.first != last.last:
         return False
-    return len(run) == 1 or (
-        abs(stroke.duration_s - run[-2].duration_s) <= _ALIKE * run[-2].duration_s
-    )
+    if len(run) == 1:
+        return True
+    before = run[-2]
+    share = max(_ALIKE, 2.01 * _TURN_SAMPLES / (before.last - before.first))
+    return abs(stroke.duration_s - before.duration_s) <= share * before.duration_s
 
 
 def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[slice]:
@@ -298,7 +314,7 @@ def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[slice]:
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
     usual_s = float(np.median(np.diff(t_s)))
     window = max(int(np.ceil(_SHORTEST_HOLD_S / usual_s)), _FEWEST_AT_REST)
-    still_m = max(_STILL_SHARE * float(np.ptp(height_m)), _TURN_NOISE * _noise_m(height_m))
+    still_m = max(_STILL_SHARE * float(np.ptp(height_m)), _TURN_NOISE * standard_noise(height_m))
     holds: list[slice] = []
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
         part = height_m[begin : end + 1]
@@ -323,7 +339,7 @@ def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[slice]:
 def _trim(rest: slice, height_m: Array, still_m: float) -> slice:
     """A rest without the ends of the adjacent strokes."""
     apart = np.abs(height_m[rest] - np.median(height_m[rest]))
-    inside = np.flatnonzero(apart <= max(_TAIL_SHARE * still_m, 4.0 * _noise_m(height_m)))
+    inside = np.flatnonzero(apart <= max(_TAIL_SHARE * still_m, 4.0 * standard_noise(height_m)))
     return slice(rest.start + int(inside[0]), rest.start + int(inside[-1]) + 1)
 
 

@@ -18,6 +18,9 @@ _MOST_IN_TRANSITION = 4
 """Strokes of no step in a row that a machine takes to get from one step to the next: half a cycle
 at the end and at the beginning, and a cycle in which it builds up the amplitude."""
 
+_LONGEST = 2.0
+"""Times the longest stroke of the steps next to it that a stroke of a transition lasts."""
+
 
 class Span(NamedTuple):
     """A stretch of a record, from `begin_s` to `end_s`.
@@ -57,7 +60,7 @@ def account(
     used = {stroke.first for block in steps for stroke in block.strokes}
     for group in _group_unused(strokes, used, rests):
         whys = [rejected[stroke.first] for stroke in group if stroke.first in rejected]
-        if not whys and len(group) <= _MOST_IN_TRANSITION:
+        if not whys and _is_transition(group, steps):
             continue
         code = -2 - len(texts)
         unlike = f"{len(group)} strokes in a row, whose amplitude, duration or shape changes"
@@ -73,6 +76,17 @@ def account(
         use, why = texts.get(code, ("step" if code > 0 else "transition", ""))
         spans.append(Span(float(t_s[begin]), float(t_s[end]), use, max(code, 0), why))
     return tuple(spans)
+
+
+def _is_transition(group: Sequence[Stroke], steps: Sequence[Block]) -> bool:
+    """Whether strokes are few, and not slower than those of the steps before and after them."""
+    if len(group) == 1 or len(group) > _MOST_IN_TRANSITION:
+        return len(group) == 1
+    before = [block for block in steps if block.begin <= group[0].first][-1:]
+    after = [block for block in steps if block.begin > group[0].first][:1]
+    usual_s = [stroke.duration_s for block in (*before, *after) for stroke in block.strokes]
+    longest_s = max(stroke.duration_s for stroke in group)
+    return longest_s <= _LONGEST * max(usual_s, default=0.0)
 
 
 def _group_unused(

@@ -5,26 +5,36 @@ test, the zero drifted, the gas warmed, or friction holds another way. A zero th
 the mean force of the cycles of a step as well; friction that holds another way does not. Both
 together determine a polynomial over time by weighted least squares, which is the drift, counted
 from its begin. Where cycles and rests contradict each other, there is none. Damping that fades
-changes the mean of a cycle, too, where one direction is stronger: that is in the weights.
+changes the mean of a cycle, too, where one direction is stronger: that is in the weights. Without
+two rests at one height, the cycles alone limit how far a zero may have drifted.
 
 Reference: Seber and Lee, Linear Regression Analysis (2003), 3.10, for generalised least squares.
 """
 
-import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from rig.dyno.figures import AtRest, ForceRecord
 from rig.dyno.stroke_force import Figure
-from rig.dyno.strokes import Array, Block
+from rig.dyno.strokes import Array, Block, standard_noise
 
 _SAME_HEIGHT_M = 5e-4
 """By which rests of one height may differ: of a gas spring of 2 N/mm that is 1 N."""
 
 _LEAST_SHARE, _MOST_SHARE = 0.5, 1.5
-"""Shares of the rests' change that the cycles have to show."""
+"""Shares of the rests' change between which the cycles confirm it."""
+
+_EXCLUDED = 2.0
+"""Standard deviations by which the cycles' share is below the least one where they exclude it."""
+
+_NO_MATTER = 0.05
+"""Share of the largest deviation from which on another one, independent of it, is considered."""
+
+_CUT = 0.4
+"""Error of a cycle's mean over the range of its force, times the square of its samples: of a sine
+that is integrated by trapezoids from between two samples on, pi/8 at most."""
 
 _FADE = 0.003
 """Share of a step's largest force by which its mean may change as it warms up: half of the fade of
@@ -37,8 +47,14 @@ _MOST_DEGREES, _FITS = 4, 3.0
 """Highest degree of the polynomial, and mean square of the misfits, in their standard deviations,
 below which a lower degree is enough."""
 
+_HALF = 1.96
+"""Standard deviations of half an interval."""
+
 _CERTAIN = 4.0
 """Standard deviations from which on a drift is one."""
+
+
+DriftKind = Literal["known", "open", "excluded", "unseen"]
 
 
 class ZeroDrift(NamedTuple):
@@ -46,24 +62,33 @@ class ZeroDrift(NamedTuple):
 
     Attributes:
         line: The change, in N, over time in s; zero at its begin.
-        begin_s: First time at which it is known; constant before.
-        end_s: Last time; constant afterwards.
+        begin_s: First time at which it is known; straight before.
+        end_s: Last time; straight afterwards.
         largest: Change from its begin to where it is largest.
-        is_known: Whether it may be removed.
+        kind: `known`: it may be removed; `open`: rests show it, and the cycles do not tell whether
+            it is one; `excluded`: rests show it, and the cycles that it is none; `unseen`: it is
+            not certain, and line and deviations say how large it may be.
         source: What shows it, as a phrase.
+        deviations: Independent deviations of the line, each half a 95 % interval.
     """
 
     line: np.polynomial.Polynomial
     begin_s: float
     end_s: float
     largest: Figure
-    is_known: bool
+    kind: DriftKind
     source: str
+    deviations: tuple[np.polynomial.Polynomial, ...]
 
     def at(self, t_s: Array) -> Array:
         """Drift at times."""
+        return self.follow(self.line, t_s)
+
+    def follow(self, line: np.polynomial.Polynomial, t_s: Array) -> Array:
+        """A line over time, straight beyond the times in which the drift is known."""
         inside_s = np.clip(t_s, self.begin_s, self.end_s)
-        return np.asarray(self.line(inside_s), np.float64)
+        beyond = line.deriv()(inside_s) * (t_s - inside_s)
+        return np.asarray(line(inside_s) + beyond, np.float64)
 
 
 class _Cycles(NamedTuple):
@@ -78,22 +103,22 @@ class _Cycles(NamedTuple):
 def estimate_drift(
     record: ForceRecord, blocks: Sequence[Block], rests: Sequence[AtRest]
 ) -> ZeroDrift | None:
-    """The drift of a record; None where neither rests nor cycles show one."""
+    """The drift of a record; None where rests show none, or nothing in it would show one."""
     mine = _alike(rests)
     cycles = [it for block in blocks if (it := _cycles_of(record, block)) is not None]
-    at_rest = _fit(mine, []) if len(mine) > 1 else None
-    if at_rest is not None and not _is_seen(at_rest):
-        at_rest = None
-    if at_rest is None:
+    if len(mine) < 2:
         moving = _fit([], cycles)
-        # Rests that do not change contradict a drift that only cycles show.
-        has_rests = len(mine) > 1
-        is_drift = moving is not None and not has_rests and _is_seen(moving)
-        return moving._replace(source="the cycles of the steps") if moving and is_drift else None
-    if not _confirm(cycles, at_rest):
-        return at_rest._replace(is_known=False)
-    both = _fit(mine, cycles)
-    return None if both is None else both._replace(source="rests and cycles")
+        if moving is None or _is_seen(moving):
+            return moving
+        half = max(abs(moving.largest.low), abs(moving.largest.high))
+        largest = Figure.around(0.0, half, moving.largest.method)
+        return moving._replace(largest=largest, kind="unseen")
+    at_rest = _fit(mine, [])
+    if at_rest is None or not _is_seen(at_rest):
+        return None
+    kind = _confirm(cycles, at_rest)
+    both = _fit(mine, cycles) if kind == "known" else None
+    return at_rest._replace(kind=kind) if both is None else both
 
 
 def _alike(rests: Sequence[AtRest]) -> list[AtRest]:
@@ -110,17 +135,22 @@ def _cycles_of(record: ForceRecord, block: Block) -> _Cycles | None:
     begins = [stroke.first for stroke in block.strokes[::2]]
     if len(begins) < 3:
         return None
-    spans = [slice(*pair) for pair in itertools.pairwise(begins)]
-    means_n = np.array([float(record.force_n[span].mean()) for span in spans])
-    times_s = np.array([float(record.t_s[span].mean()) for span in spans])
+    t_s = record.t_s[begins[0] : begins[-1] + 1]
+    force_n = record.force_n[begins[0] : begins[-1] + 1]
+    # A cycle begins and ends between two samples.
+    edges_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), len(begins))
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (force_n[1:] + force_n[:-1]) * np.diff(t_s))])
+    means_n: Array = np.diff(np.interp(edges_s, t_s, integral)) / np.diff(edges_s)
+    times_s: Array = 0.5 * (edges_s[1:] + edges_s[:-1])
     about_s = times_s - times_s.mean()
     slope = float(about_s @ means_n) / float(about_s @ about_s)
     length_s = float(times_s[-1] - times_s[0])
-    force_n = record.force_n[begins[0] : begins[-1]]
-    a_cycle = len(force_n) / len(spans)
-    # A cycle begins and ends between two samples, and its samples have noise.
-    cut_n = float(np.ptp(force_n)) / a_cycle
-    std_n = cut_n * length_s / float(about_s @ about_s) ** 0.5
+    a_cycle = len(force_n) / len(means_n)
+    cut_n = _CUT * float(np.ptp(force_n)) / a_cycle**2
+    left_n = means_n - means_n.mean() - slope * about_s
+    scatter_n = float(left_n @ left_n / max(len(left_n) - 2, 1)) ** 0.5
+    std_n = max(cut_n, scatter_n, standard_noise(force_n) / a_cycle**0.5)
+    std_n *= length_s / float(about_s @ about_s) ** 0.5
     stroke = block.strokes[0]
     if abs(stroke.rise_m) / stroke.duration_s > _SLOW_M_PER_S * 2.0 / np.pi:
         std_n = float(np.hypot(std_n, _FADE * float(np.abs(force_n).max())))
@@ -151,41 +181,59 @@ def _fit(rests: Sequence[AtRest], cycles: Sequence[_Cycles]) -> ZeroDrift | None
         at_cycles = share[2][:, None] ** powers - share[1][:, None] ** powers
         level = np.concatenate([np.ones(len(rest_s)), np.zeros(len(change_n))])
         design = np.column_stack([np.concatenate([at_rest, at_cycles]), level]) * weights[:, None]
-        found = np.linalg.lstsq(design, target, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(design, target, rcond=None)[0], np.float64)
         residual = target - design @ found
         freedom = equations - degree
         misfit = float(residual @ residual)
         if degree >= _MOST_DEGREES or freedom < 1 or misfit <= _FITS * freedom:
             break
-    covariance = np.linalg.pinv(design.T @ design)[:degree, :degree]
+    covariance = np.asarray(np.linalg.pinv(design.T @ design), np.float64)[:degree, :degree]
     covariance = covariance * max(1.0, misfit / max(freedom, 1))
-    line = np.polynomial.Polynomial(
-        [0.0, *found[:degree]], domain=[begin_s, end_s], window=[0.0, 1.0]
-    )
+    span_s = (begin_s, end_s)
     shares = np.linspace(0.0, 1.0, 101)[:, None] ** powers
     drift_n = shares @ found[:degree]
     at = int(np.argmax(np.abs(drift_n)))
-    value = float(drift_n[at])
-    half = 1.96 * float(shares[at] @ covariance @ shares[at]) ** 0.5
-    figure = Figure.around(value, half, f"polynomial of degree {degree} over time")
-    return ZeroDrift(line, begin_s, end_s, figure, is_known=True, source="rests at one height")
+    half = _HALF * float(shares[at] @ covariance @ shares[at]) ** 0.5
+    largest = Figure.around(float(drift_n[at]), half, f"polynomial of degree {degree} over time")
+    source = " and ".join(["rests"] * bool(rests) + ["cycles"] * bool(cycles))
+    deviations = tuple(_line(it, span_s) for it in _principal(covariance, shares))
+    line = _line(found[:degree], span_s)
+    return ZeroDrift(line, begin_s, end_s, largest, "known", source, deviations)
+
+
+def _line(weights: Array, span_s: tuple[float, float]) -> np.polynomial.Polynomial:
+    """A polynomial over a time, zero at its begin."""
+    return np.polynomial.Polynomial([0.0, *weights], domain=span_s, window=[0.0, 1.0])
+
+
+def _principal(covariance: Array, shares: Array) -> list[Array]:
+    """Independent deviations of a polynomial's weights (D,) that matter, 1.96 times their own."""
+    variances, axes = np.linalg.eigh(covariance)
+    found = [
+        _HALF * variance**0.5 * axis
+        for variance, axis in zip(variances.clip(0.0), axes.T, strict=True)
+    ]
+    sizes_n = [float(np.abs(shares @ it).max()) for it in found]
+    return [
+        it for it, size_n in zip(found, sizes_n, strict=True) if size_n > _NO_MATTER * max(sizes_n)
+    ]
 
 
 def _is_seen(drift: ZeroDrift) -> bool:
     half = drift.largest.half
-    return abs(drift.largest.value) > _CERTAIN / 1.96 * half
+    return abs(drift.largest.value) > _CERTAIN / _HALF * half
 
 
-def _confirm(cycles: Sequence[_Cycles], drift: ZeroDrift) -> bool:
+def _confirm(cycles: Sequence[_Cycles], drift: ZeroDrift) -> DriftKind:
     """Whether the cycles change as the rests do, by weighted least squares."""
-    if not cycles:
-        return False
     # Also beyond the rests, if these are not all along the test.
     x = np.array([drift.line(it.last_s) - drift.line(it.first_s) for it in cycles])
     y = np.array([it.change_n for it in cycles])
     w = np.array([it.std_n for it in cycles]) ** -2.0
     power = float(w @ (x * x))
     if power <= 0.0:
-        return False
+        return "open"
     share, std = float(w @ (x * y)) / power, power**-0.5
-    return share - std >= _LEAST_SHARE and share + std <= _MOST_SHARE
+    if share - std >= _LEAST_SHARE and share + std <= _MOST_SHARE:
+        return "known"
+    return "excluded" if share + _EXCLUDED * std < _LEAST_SHARE else "open"

@@ -31,7 +31,9 @@ faults: a lag of the force of 1 to 10 ms, a drift of the zero by 5 to 20 % of th
 clipping at 50 to 90 % of it, before or behind the noise, or up to five spikes.
 
 The table gives the share of the 95 % intervals that contain the true value, and their number, for
-each fault. A bound counts as right if the true value is beyond it. *Missing* is the share of steps
+each fault. Friction and gas force are those without damping where a second step is slow enough to
+know it, else those at the speed of the slowest step. Without two rests, the zero is that at the
+first cycle. A bound counts as right if the true value is beyond it. *Missing* is the share of steps
 that are not reported, *ordinary* the share of clipped forces that are given as ordinary figures.
 """
 
@@ -105,16 +107,15 @@ def one(seed):
     except InputError:
         return fault, hits, (len(day.steps), len(day.steps)), (0, 0)
     # A zero that drifts is that of the time from which on it is known.
-    drift, zero_n = found.corrections.drift, 0.0
-    if drift is not None and found.corrections.removes_drift:
-        zero_n = day.drift_n * drift.begin_s / day.length_s
+    drift = found.corrections.drift
+    zero_n = 0.0 if drift is None else day.drift_n * drift.begin_s / day.length_s
 
     def add(name, figure, truth):
         if figure is not None:
             hits[name].append(figure.low <= truth <= figure.high)
 
     steps, forces = of_steps(day, found, zero_n, add)
-    of_damper(day, found.damper, zero_n, add)
+    of_damper(day, found, zero_n, add)
     return fault, hits, steps, forces
 
 
@@ -139,11 +140,16 @@ def of_steps(day, found, zero_n, add):
     return (missing, len(day.steps)), (ordinary, clipped)
 
 
-def of_damper(day, damper, zero_n, add):
+def of_damper(day, found, zero_n, add):
     """Figures over all steps."""
-    true = day.damper
-    add("gas", damper.gas_force_n, true.gas_n + zero_n)
-    add("friction", damper.friction_n, true.friction_n)
+    true, damper = day.damper, found.damper
+    gas_n, friction_n = true.gas_n, true.friction_n
+    if any("with what bleeds there" in note for note in damper.notes):
+        index = int(np.argmin([step.speed_m_per_s for step in day.steps]))
+        down_n, up_n = day.truth(index)
+        gas_n, friction_n = 0.5 * (down_n + up_n), 0.5 * (down_n - up_n)
+    add("gas", damper.gas_force_n, gas_n + zero_n)
+    add("friction", damper.friction_n, friction_n)
     for side, opens in zip(SIDES, (true.opens, true.opens_up), strict=True):
         add("knee", damper.knee_m_per_s[side], opens)
         slope = damper.force_per_kelvin_n_per_k[side]

@@ -12,6 +12,7 @@ from rig.dyno.corrections import RequestedCorrections
 from rig.dyno.figures import ForceRecord
 from tests.dyno import days
 from tests.dyno.days import Step
+from tests.dyno.many_days import rate_of
 from tests.dyno.population import Damper
 
 
@@ -96,7 +97,7 @@ def test_a_lag_of_the_cell_is_found_and_removed(lag_s):
     assert_right(found, day, wider_n=0.5)
     rates = [step.spring_rate_n_per_m for step in found.steps]
     assert max(rate.value for rate in rates) < 1.01 * min(rate.value for rate in rates)
-    kept = characterised(day, RequestedCorrections(lag=False))
+    kept = characterised(day, RequestedCorrections(lag_s=0.0))
     assert kept.corrections.removed_lag_s == 0.0
     assert "not removed" in " ".join(kept.quality)
     shown = [step.spring_rate_n_per_m.value for step in kept.steps]
@@ -140,6 +141,46 @@ def test_friction_that_holds_another_way_is_no_drift():
     assert found.corrections.drift is not None
     assert not found.corrections.removes_drift
     assert "friction that holds another way" in " ".join(found.quality)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.006])
+@pytest.mark.parametrize("speeds", [(0.4,), (0.1, 0.4)])
+def test_a_lag_that_few_steps_do_not_determine_is_in_the_intervals(lag_s, speeds):
+    """One step does not tell a spring from a lag: both figures contain their true values."""
+    steps = tuple(Step(0.025, speed, 8) for speed in speeds)
+    day = replace(usual(lag_s=lag_s), steps=steps)
+    found = characterised(day)
+    lag = found.corrections.lag
+    assert found.corrections.removed_lag_s == 0.0
+    assert (lag.kind, lag.figure.low) == ("open", 0.0)
+    assert lag.figure.high >= lag_s
+    assert_right(found, day, wider_n=0.0)
+    rate_n_per_m = rate_of(day)
+    for step in found.steps:
+        rate = step.spring_rate_n_per_m
+        assert 0.999 * rate.low <= rate_n_per_m <= 1.001 * rate.high
+    stated = characterised(day, RequestedCorrections(lag_s=lag_s))
+    assert_right(stated, day, wider_n=0.5)
+    widths = [
+        [step.compression.force_at_peak_velocity_n.half for step in it.steps]
+        for it in (stated, found)
+    ]
+    assert all(known <= 1.1 * unknown for known, unknown in zip(*widths, strict=True))
+
+
+@pytest.mark.parametrize("drift_n", [0.0, 15.0])
+def test_a_drift_that_no_rest_shows_is_in_the_intervals(drift_n):
+    steps = (Step(0.025, 0.8, 8, 0.0),)
+    day = replace(usual(drift_n=drift_n, first_rest_s=0.0), steps=steps)
+    found = characterised(day)
+    assert found.corrections.drift.kind == "unseen"
+    assert "without two rests at one height" in " ".join(found.quality)
+    assert_right(found, day, wider_n=0.0)
+    stated = characterised(day, RequestedCorrections(zero=False))
+    width_n, known_n = (
+        it.steps[0].compression.force_at_peak_velocity_n.half for it in (found, stated)
+    )
+    assert width_n > known_n
 
 
 def test_drift_and_clipping_together_leave_bounds_that_are_right():
