@@ -135,7 +135,8 @@ def characterise_record(
     if levels != ForceRange():
         faults = faults._replace(limits=faults.limits.within(levels))
         kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
-    drift = estimate_drift(record, blocks, [compute_rest(record, here) for here in rests])
+    at_rest = [compute_rest(record, here) for here in rests]
+    drift = estimate_drift(record, blocks, at_rest, faults.limits)
     corrections = decide(requested, record, [step for _, step in kept], drift)
     if corrections.any:
         record = corrections.apply(record)
@@ -153,10 +154,14 @@ def characterise_record(
     others = [
         (other, tuple(other.apply(step) for step in marked)) for other in corrections.alternatives()
     ]
-    damper = cover(
-        summarise_damper(marked), [(other, summarise_damper(steps)) for other, steps in others]
-    )
-    steps = cover(marked, others)
+    damper = summarise_damper(marked)
+    # With another knee, friction and gas would be without another damping.
+    dampers = [
+        (other, like)
+        for other, steps in others
+        if (like := summarise_damper(steps)).bent_sides == damper.bent_sides
+    ]
+    steps, damper = cover(marked, others), cover(damper, dampers)
     return Characteristics(record, steps, holds, damper, corrections, warnings, spans)
 
 

@@ -56,6 +56,11 @@ class Damper(NamedTuple):
     share_per_kelvin_per_k: dict[str, Figure | None]
     notes: tuple[str, ...]
 
+    @property
+    def bent_sides(self) -> frozenset[str]:
+        """Directions that have a knee."""
+        return frozenset(side for side, knee in self.knee_m_per_s.items() if knee is not None)
+
     def properties(self) -> dict[str, tuple[str, Figure]]:
         """Unit and figure of each property of the damper that the test determines, by name."""
         named = {

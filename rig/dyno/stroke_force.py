@@ -97,6 +97,13 @@ class ForceRange(NamedTuple):
         """The range that both leave."""
         return ForceRange(max(self.low_n, other.low_n), min(self.high_n, other.high_n))
 
+    def touches(self, force_n: Array) -> bool:
+        """Whether forces reach an end of it, or nearly."""
+        low, high = self.low_n, self.high_n
+        at_low = math.isfinite(low) and force_n.min() <= low + _AT_LIMIT_SHARE * abs(low)
+        at_high = math.isfinite(high) and force_n.max() >= high - _AT_LIMIT_SHARE * abs(high)
+        return bool(at_low or at_high)
+
 
 _MIDDLE, _CONSTANT = 0.5, 0.1
 """Half of the stroke, and how much of the speed may differ in it where it is called constant: under

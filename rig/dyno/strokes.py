@@ -141,6 +141,11 @@ class Block(NamedTuple):
     end: int
     cycles: float
 
+    @property
+    def samples(self) -> slice:
+        """Its samples in the record."""
+        return slice(self.begin, self.end)
+
 
 def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
     """All strokes of a record: times, increasing, and heights, shape (N,)."""

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rig.dyno.figures import AtRest, ForceRecord
-from rig.dyno.stroke_force import Figure
+from rig.dyno.stroke_force import Figure, ForceRange
 from rig.dyno.strokes import Array, Block, standard_noise
 
 _SAME_HEIGHT_M = 5e-4
@@ -36,12 +36,9 @@ _CUT = 0.4
 """Error of a cycle's mean over the range of its force, times the square of its samples: of a sine
 that is integrated by trapezoids from between two samples on, pi/8 at most."""
 
-_FADE = 0.003
-"""Share of a step's largest force by which its mean may change as it warms up: half of the fade of
-2 % in a step, of a damper whose rebound is twice its compression."""
-
-_SLOW_M_PER_S = 5e-3
-"""Speed up to which there is no damping to fade."""
+_MEAN_SHARE = 1.0 / np.pi
+"""Mean force of a cycle over its largest force where one direction alone damps: what a relative
+fade of the damping changes the mean by is at most so much."""
 
 _MOST_DEGREES, _FITS = 4, 3.0
 """Highest degree of the polynomial, and mean square of the misfits, in their standard deviations,
@@ -101,11 +98,15 @@ class _Cycles(NamedTuple):
 
 
 def estimate_drift(
-    record: ForceRecord, blocks: Sequence[Block], rests: Sequence[AtRest]
+    record: ForceRecord, blocks: Sequence[Block], rests: Sequence[AtRest], limits: ForceRange
 ) -> ZeroDrift | None:
-    """The drift of a record; None where rests show none, or nothing in it would show one."""
+    """The drift of a record; None where rests show none, or nothing in it would show one.
+
+    The cycles of steps whose force was clipped, at `limits`, are not used.
+    """
     mine = _alike(rests)
-    cycles = [it for block in blocks if (it := _cycles_of(record, block)) is not None]
+    whole = [block for block in blocks if not limits.touches(record.force_n[block.samples])]
+    cycles = [it for block in whole if (it := _cycles_of(record, block)) is not None]
     if len(mine) < 2:
         moving = _fit([], cycles)
         if moving is None or _is_seen(moving):
@@ -132,29 +133,46 @@ def _alike(rests: Sequence[AtRest]) -> list[AtRest]:
 
 def _cycles_of(record: ForceRecord, block: Block) -> _Cycles | None:
     """How the mean force of a block's cycles changes; None with less than two whole cycles."""
-    begins = [stroke.first for stroke in block.strokes[::2]]
+    strokes = block.strokes
+    begins = [stroke.first for stroke in strokes[::2]]
+    if len(strokes) % 2 == 0:
+        begins.append(strokes[-1].last)
     if len(begins) < 3:
         return None
     t_s = record.t_s[begins[0] : begins[-1] + 1]
     force_n = record.force_n[begins[0] : begins[-1] + 1]
     # A cycle begins and ends between two samples.
     edges_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), len(begins))
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (force_n[1:] + force_n[:-1]) * np.diff(t_s))])
-    means_n: Array = np.diff(np.interp(edges_s, t_s, integral)) / np.diff(edges_s)
     times_s: Array = 0.5 * (edges_s[1:] + edges_s[:-1])
-    about_s = times_s - times_s.mean()
-    slope = float(about_s @ means_n) / float(about_s @ about_s)
-    length_s = float(times_s[-1] - times_s[0])
-    a_cycle = len(force_n) / len(means_n)
+    a_cycle = len(force_n) / len(times_s)
     cut_n = _CUT * float(np.ptp(force_n)) / a_cycle**2
-    left_n = means_n - means_n.mean() - slope * about_s
-    scatter_n = float(left_n @ left_n / max(len(left_n) - 2, 1)) ** 0.5
-    std_n = max(cut_n, scatter_n, standard_noise(force_n) / a_cycle**0.5)
-    std_n *= length_s / float(about_s @ about_s) ** 0.5
-    stroke = block.strokes[0]
-    if abs(stroke.rise_m) / stroke.duration_s > _SLOW_M_PER_S * 2.0 / np.pi:
-        std_n = float(np.hypot(std_n, _FADE * float(np.abs(force_n).max())))
-    return _Cycles(float(times_s[0]), float(times_s[-1]), slope * length_s, max(std_n, 1e-12))
+    least_n = max(cut_n, standard_noise(force_n) / a_cycle**0.5)
+    change_n, std_n = _trend(times_s, _means(edges_s, t_s, force_n), least_n)
+    # Damping that fades makes the cycles smaller, and their mean too, where it is not symmetrical.
+    sizes_n = _means(edges_s, t_s, np.abs(force_n - force_n.mean()))
+    smaller_n, smaller_std_n = _trend(times_s, sizes_n, least_n)
+    fade = float(np.hypot(smaller_n, smaller_std_n)) / float(sizes_n.mean())
+    fade_n = _MEAN_SHARE * fade * float(np.abs(force_n - force_n.mean()).max())
+    std_n = max(float(np.hypot(std_n, fade_n)), 1e-12)
+    return _Cycles(float(times_s[0]), float(times_s[-1]), change_n, std_n)
+
+
+def _means(edges_s: Array, t_s: Array, values: Array) -> Array:
+    """Means between edges of values at times, by trapezoids."""
+    areas = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)
+    integral = np.concatenate([[0.0], np.cumsum(areas)])
+    return np.asarray(np.diff(np.interp(edges_s, t_s, integral)) / np.diff(edges_s), np.float64)
+
+
+def _trend(times_s: Array, values: Array, least_std: float) -> tuple[float, float]:
+    """Change of values from the first to the last time by a straight line, and its deviation."""
+    about_s = times_s - times_s.mean()
+    squares = float(about_s @ about_s)
+    slope = float(about_s @ values) / squares
+    left = values - values.mean() - slope * about_s
+    scatter = float(left @ left / max(len(left) - 2, 1)) ** 0.5
+    length_s = float(times_s[-1] - times_s[0])
+    return slope * length_s, max(least_std, scatter) * length_s / squares**0.5
 
 
 def _fit(rests: Sequence[AtRest], cycles: Sequence[_Cycles]) -> ZeroDrift | None:

@@ -3,12 +3,13 @@
 import datetime
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median_high
+from statistics import median, median_high
 from typing import Any, NamedTuple
 
+from rig.fleet.scatter import common_scatter
 from rig.fleet.sources import UNKNOWN
 from rig.fleet.store import connect
 from rig.fleet.trends import (
@@ -21,6 +22,7 @@ from rig.fleet.trends import (
     find_change_point,
     find_outliers,
     fit_drift,
+    visible_step,
     without_step,
 )
 
@@ -29,6 +31,8 @@ SCALED_BY_FORCE = ("stiffness_n_per_m", "damping_n_s_per_m", "friction_n", "gas_
 
 _FORCE = re.compile(r"_n(_per_|_s|$)")
 """Units of what is proportional to a force: N, N/m, N·s/m, ..."""
+
+_MONTH_DAYS = 365.25 / 12.0
 
 _RECENT = 5
 """Last points of a series whose median stands for the damper as it is now."""
@@ -57,6 +61,18 @@ class Where(NamedTuple):
     damper: str
 
 
+class Visible(NamedTuple):
+    """Changes of a series that are seen with a chance of 90 %.
+
+    Attributes:
+        drift_per_day: Slope of a straight line.
+        step: A step in the middle; None where the series is too short for a change-point.
+    """
+
+    drift_per_day: float
+    step: float | None
+
+
 class Series(NamedTuple):
     """A quantity of a damper over time.
 
@@ -66,6 +82,7 @@ class Series(NamedTuple):
         change: Its likeliest change-point; None where it is too short.
         is_change: Whether that is significant in the whole fleet.
         is_drift: Whether the slope is, where there is no change-point.
+        visible: What would have been seen; None where it is too short for a straight line.
     """
 
     where: Where
@@ -75,6 +92,7 @@ class Series(NamedTuple):
     change: ChangePoint | None
     is_change: bool
     is_drift: bool
+    visible: Visible | None
 
 
 class Jump(NamedTuple):
@@ -100,6 +118,45 @@ class Outlier(NamedTuple):
     value: float
     usual: float
     distance: float
+
+
+class Power(NamedTuple):
+    """What would be seen of a quantity with a chance of 90 %: medians over the dampers.
+
+    Attributes:
+        dampers: Dampers of which there is a value.
+        runs: Runs of a damper.
+        scatter: Standard deviation from run to run, as a share of the value; None unknown.
+        drift_per_month: Slope, as a share of the value; None with less than three days.
+        step: A step in the middle, as a share of the value; None with less than ten runs.
+    """
+
+    quantity: str
+    dampers: int
+    runs: float
+    scatter: float | None
+    drift_per_month: float | None
+    step: float | None
+
+
+def _power(quantity: SeriesQuantity, items: Sequence[Series]) -> Power:
+    levels = [abs(item.drift.level) for item in items if item.drift is not None]
+    level = float(median(levels)) if levels else 0.0
+    lines = [item.drift for item in items if item.drift is not None]
+    seen = [item.visible for item in items if item.visible is not None]
+    steps = [it.step for it in seen if it.step is not None]
+
+    def share(values: Sequence[float]) -> float | None:
+        return float(median(values)) / level if values and level > 0.0 else None
+
+    return Power(
+        quantity.words,
+        len(items),
+        float(median(len(item.points) for item in items)),
+        share([line.scatter.variance**0.5 for line in lines]),
+        share([_MONTH_DAYS * it.drift_per_day for it in seen]),
+        share(steps),
+    )
 
 
 @dataclass(frozen=True)
@@ -135,6 +192,13 @@ class Overview:
             f"{self.model}{left_out}"
         )
 
+    def powers(self) -> list[Power]:
+        """What would have been seen, by quantity."""
+        by_quantity: dict[SeriesQuantity, list[Series]] = {}
+        for item in self.series:
+            by_quantity.setdefault(item.quantity, []).append(item)
+        return [_power(quantity, items) for quantity, items in by_quantity.items()]
+
     def as_dict(self) -> dict[str, object]:
         """For JSON; series without their points."""
         return {
@@ -158,10 +222,15 @@ class Overview:
                 if item.is_change and item.change is not None
             ],
             "drifts": [
-                {**_place(item), **item.drift._asdict()}
+                {
+                    **_place(item),
+                    **{key: getattr(item.drift, key) for key in ("per_day", "low", "high", "p")},
+                    "level": item.drift.level,
+                }
                 for item in self.series
                 if item.is_drift and item.drift is not None
             ],
+            "visible": [power._asdict() for power in self.powers()],
             "outliers": [
                 {
                     **_place(item),
@@ -293,19 +362,28 @@ def _step_day(
 
 def _series(collected: _Collected, step_days: Mapping[str, float]) -> tuple[Series, ...]:
     """Every series with what is significant among all of them."""
-    every = [
-        (where, quantity, points)
-        for quantity, by_place in sorted(collected.items())
-        for where, points in sorted(by_place.items())
-    ]
-    level = LEVEL / max(1, sum(len(points) >= FEWEST for _, _, points in every))
+    lines: dict[tuple[SeriesQuantity, Where], Drift | None] = {}
+    for quantity, by_place in sorted(collected.items()):
+        days = {where: _step_day(step_days, where, quantity) for where in by_place}
+        own = [fit_drift(points, days[where]) for where, points in by_place.items()]
+        common = common_scatter([line.scatter for line in own if line is not None])
+        for where, points in sorted(by_place.items()):
+            lines[quantity, where] = fit_drift(points, days[where], common)
+    tested = [points for by_place in collected.values() for points in by_place.values()]
+    level = LEVEL / max(1, sum(line is not None for line in lines.values()))
+    change_level = LEVEL / max(1, sum(len(points) >= FEWEST for points in tested))
     found: list[Series] = []
-    for where, quantity, points in every:
-        line = fit_drift(points, _step_day(step_days, where, quantity))
+    for (quantity, where), line in lines.items():
+        points = collected[quantity][where]
         change = find_change_point(points)
-        is_change = change is not None and change.p < level
-        is_drift = line is not None and len(points) >= FEWEST and line.p < level and not is_change
-        found.append(Series(where, quantity, tuple(points), line, change, is_change, is_drift))
+        is_change = change is not None and change.p < change_level
+        is_drift = line is not None and line.p < level and not is_change
+        visible = None
+        if line is not None:
+            visible = Visible(line.visible_per_day(level), visible_step(points, change_level))
+        found.append(
+            Series(where, quantity, tuple(points), line, change, is_change, is_drift, visible)
+        )
     return tuple(found)
 
 

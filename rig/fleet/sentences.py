@@ -1,7 +1,7 @@
 """What a store says, in sentences."""
 
-from rig.fleet.overview import Jump, Outlier, Overview, Series, date_of
-from rig.fleet.trends import ChangePoint, Drift
+from rig.fleet.overview import Jump, Outlier, Overview, Power, Series, date_of
+from rig.fleet.trends import EDGE, FEWEST, ChangePoint, Drift
 
 
 def alarm_sentences(found: Overview) -> list[str]:
@@ -16,6 +16,24 @@ def alarm_sentences(found: Overview) -> list[str]:
         for item in found.outliers
     ]
     return lines
+
+
+def power_sentences(found: Overview) -> list[str]:
+    """A sentence for each quantity on the changes that cannot be seen in it."""
+    return [_power_sentence(power) for power in found.powers()]
+
+
+def _power_sentence(power: Power) -> str:
+    begin = f"{power.quantity}, {power.runs:g} runs a damper"
+    if power.drift_per_month is None:
+        return f"{begin}: no change can be seen, expected runs on three days at least"
+    drift = f"a drift of less than {100 * power.drift_per_month:.2g} % a month"
+    if power.step is None:
+        return (
+            f"{begin}: {drift} cannot be seen, nor any step: it takes {FEWEST} runs, of which "
+            f"{EDGE} after it"
+        )
+    return f"{begin}: {drift} or a step of less than {100 * power.step:.2g} % cannot be seen"
 
 
 def series_name(item: Series | Outlier) -> str:

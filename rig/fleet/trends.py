@@ -12,8 +12,12 @@ from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq  # pyright: ignore[reportUnknownVariableType]
 from scipy.stats import f as fisher
+from scipy.stats import ncf as noncentral
 from scipy.stats import t as student
+
+from rig.fleet.scatter import POWER, Scatter
 
 Array = NDArray[np.float64]
 Member = TypeVar("Member")
@@ -24,7 +28,7 @@ LEVEL = 0.01
 FEWEST = 10
 """Points of a series from which on a change-point is looked for."""
 
-_EDGE = 3
+EDGE = 3
 """Points that each side of a change has at least: a line through two of them fits anything."""
 
 _DRAWS = 40_000
@@ -93,6 +97,8 @@ class Drift(NamedTuple):
         per_day: Change per day.
         level: Value of the line in the middle.
         p: Chance of a slope as large without a drift.
+        scatter: Scatter about the line.
+        squares_days2: Sum of squares of the days about their mean, as far as they tell the slope.
     """
 
     per_day: float
@@ -100,6 +106,12 @@ class Drift(NamedTuple):
     high: float
     level: float
     p: float
+    scatter: Scatter
+    squares_days2: float
+
+    def visible_per_day(self, level: float) -> float:
+        """Change per day that is seen with a chance of 90 %, at a level of significance."""
+        return self.scatter.visible_slope(self.squares_days2, level)
 
 
 def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
@@ -114,10 +126,15 @@ def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
     return _describe_change(days, y, _chance(tuple(np.round(days - days[0], 6)), statistic))
 
 
-def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> Drift | None:
+def fit_drift(
+    points: Sequence[DatedValue],
+    stepped_on: float | None = None,
+    common: Scatter | None = None,
+) -> Drift | None:
     """The straight line through a series by day; None with too few days for it.
 
-    `stepped_on` is the day of a step of unknown size that is not its own.
+    `stepped_on` is the day of a step of unknown size that is not its own, `common` the scatter of
+    the quantity in all dampers.
     """
     days = np.array([point.day for point in points])
     if len(np.unique(days)) < 3:
@@ -131,11 +148,50 @@ def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> 
     left = y - columns @ weights
     span = float(np.ptp(days))
     slope = float(weights[1]) / span
-    variance = left @ left / free * np.linalg.inv(columns.T @ columns)[1, 1]
-    error = float(np.sqrt(variance)) / span
-    half = error * float(student.ppf(0.975, free))
-    p = float(2.0 * student.sf(abs(slope) / max(error, 1e-300), free))
-    return Drift(slope, slope - half, slope + half, float(y.mean()), p)
+    scatter = Scatter(float(left @ left) / free, float(free)).pooled(common)
+    squares_days2 = span**2 / float(np.linalg.inv(columns.T @ columns)[1, 1])
+    error = (scatter.variance / squares_days2) ** 0.5
+    half = error * float(student.ppf(0.975, scatter.freedom))
+    p = float(2.0 * student.sf(abs(slope) / max(error, 1e-300), scatter.freedom))
+    level = float(y.mean())
+    return Drift(slope, slope - half, slope + half, level, p, scatter, squares_days2)
+
+
+def visible_step(points: Sequence[DatedValue], level: float) -> float | None:
+    """Size of a step in the middle of a series that is seen with a chance of 90 %, at a level.
+
+    None where no change-point is looked for.
+    """
+    days = np.array([point.day for point in points])
+    if len(points) < FEWEST or not _change_indices(days):
+        return None
+    columns = _columns(days, _middle(days))
+    y = np.array([point.value for point in points])
+    line, _ = np.linalg.qr(columns[:, :2])
+    left = y - line @ (line.T @ y)
+    step = columns[:, 2] - line @ (line.T @ columns[:, 2])
+    freedom = len(days) - 3
+    of_step = step * (step @ left) / (step @ step)
+    variance = float(np.sum((left - of_step) ** 2)) / freedom
+    critical = _critical(tuple(np.round(days - days[0], 6)), level)
+    # The true instant is one of those that are tried: the largest F is at least that one's.
+    return (_noncentrality(critical, len(days) - 4) * variance / float(step @ step)) ** 0.5
+
+
+@lru_cache(maxsize=256)
+def _noncentrality(critical: float, freedom: int) -> float:
+    """Of an F of two degrees of freedom over others that exceeds a value with the usual power."""
+
+    def lacks(noncentrality: float) -> float:
+        return POWER - float(noncentral.sf(critical, 2, freedom, noncentrality))
+
+    return float(brentq(lacks, 1e-6, 1e6))
+
+
+def _middle(days: Array) -> int:
+    """Index of the first point after a change in the middle."""
+    found = _change_indices(days)
+    return found[len(found) // 2]
 
 
 def without_step(points: Sequence[DatedValue], day: float | None) -> list[DatedValue]:
@@ -149,7 +205,7 @@ def without_step(points: Sequence[DatedValue], day: float | None) -> list[DatedV
 def _line_and_step(days: Array, day: float | None) -> Array:
     """Line, and step where there are points enough on either side, shape (N, 2 or 3)."""
     index = len(days) if day is None else int(np.searchsorted(days, day))
-    has_step = _EDGE <= index <= len(days) - _EDGE
+    has_step = EDGE <= index <= len(days) - EDGE
     columns = _columns(days, index if has_step else 1)
     return columns[:, : 3 if has_step else 2]
 
@@ -197,7 +253,7 @@ def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) ->
         The change, if it is significant and at least two dampers share it; ``before`` and
         ``after`` are logarithms of the common factor.
     """
-    usable = {name: points for name, points in series.items() if len(points) >= 2 * _EDGE}
+    usable = {name: points for name, points in series.items() if len(points) >= 2 * EDGE}
     if len(usable) < _SHARED:
         return None
     by_day: dict[float, list[float]] = {}
@@ -234,7 +290,7 @@ def _step_at(points: Sequence[DatedValue], day: float) -> float | None:
 
 def _change_indices(days: Array) -> list[int]:
     """Indices of the first point after a change, each on another day."""
-    found = [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
+    found = [k for k in range(EDGE, len(days) - EDGE + 1) if days[k] > days[k - 1]]
     return found[:: -(-len(found) // _MOST_CHANGES)] if found else []
 
 
@@ -248,7 +304,7 @@ def _columns(days: Array, index: int) -> Array:
 
 def _largest(days: Array, y: Array) -> Array:
     """Largest F over all change-points of each column of y, shape (N, M)."""
-    line, _ = np.linalg.qr(_columns(days, _EDGE)[:, :2])
+    line, _ = np.linalg.qr(_columns(days, EDGE)[:, :2])
     left = y - line @ (line.T @ y)
     total = np.sum(left**2, axis=0)
     best = np.zeros(y.shape[1])
@@ -285,6 +341,12 @@ def _chance(days: tuple[float, ...], statistic: float) -> float:
     known = float(drawn[-_TAIL])
     independent = (_TAIL / len(drawn)) / max(float(fisher.sf(known, 2, free)), 1e-300)
     return min(1.0, independent * float(fisher.sf(statistic, 2, free)))
+
+
+@lru_cache(maxsize=256)
+def _critical(days: tuple[float, ...], level: float) -> float:
+    """Largest F that a straight line exceeds with a chance of `level`."""
+    return float(brentq(lambda f: _chance(days, f) - level, 1e-3, 1e7))
 
 
 _KINDS: tuple[tuple[Literal["step", "bend"], list[int]], ...] = (

@@ -168,7 +168,7 @@ def test_a_lag_that_few_steps_do_not_determine_is_in_the_intervals(lag_s, speeds
     assert all(known <= 1.1 * unknown for known, unknown in zip(*widths, strict=True))
 
 
-@pytest.mark.parametrize("drift_n", [0.0, 15.0])
+@pytest.mark.parametrize("drift_n", [0.0, 1.0])
 def test_a_drift_that_no_rest_shows_is_in_the_intervals(drift_n):
     steps = (Step(0.025, 0.8, 8, 0.0),)
     day = replace(usual(drift_n=drift_n, first_rest_s=0.0), steps=steps)
