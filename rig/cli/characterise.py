@@ -85,8 +85,8 @@ def characterise_command(
     --tolerance, the exit code is 1 unless every point of the band passes; with --master, unless the
     damper agrees with the master in all steps of the master's record.
     """
-    from rig.dyno.corrections import RequestedCorrections
     from rig.dyno.report import content_of, evaluate_records, write_content
+    from rig.dyno.request import Request
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
     from rig.pages.identity import parse_labels
@@ -100,7 +100,7 @@ def characterise_command(
     if junit is not None and tolerance is None and master is None:
         raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    requested = RequestedCorrections(zero, None if lag_ms is None else 1e-3 * lag_ms)
+    requested = Request(zero, None if lag_ms is None else 1e-3 * lag_ms)
     reports = evaluate_records(runs, strut, band, master, scatter, requested)
     content = content_of(reports, serial, band)
     if out is not None:

@@ -244,7 +244,7 @@ def report_command(
 
 
 def _print(whole: "Overview") -> None:
-    from rig.fleet.sentences import alarm_sentences
+    from rig.fleet.sentences import alarm_sentences, power_sentences
 
     print_text(whole.words)
     rows = [
@@ -254,5 +254,7 @@ def _print(whole: "Overview") -> None:
     print_table(("bench", "verdicts"), rows)
     for line in alarm_sentences(whole) or ["Nothing changed, drifts or stands out."]:
         print_text(f"- {line}")
+    for line in power_sentences(whole):
+        print_text(f"- not to be seen: {line}", style="dim")
     for error, count in list(whole.failed.items())[:5]:
         print_text(f"failed, {count}: {error}", style="red")

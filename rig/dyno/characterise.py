@@ -8,13 +8,8 @@ import numpy as np
 
 from can_dbc.errors import InputError, expected_name
 from rig.dyno.alternatives import cover
-from rig.dyno.corrections import (
-    ALL_CORRECTIONS,
-    NO_CORRECTIONS,
-    Corrections,
-    RequestedCorrections,
-    decide,
-)
+from rig.dyno.corrections import NO_CORRECTIONS, Corrections, decide
+from rig.dyno.curves import CurvePoint, compute_curves
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import (
     LOAD_CELL,
@@ -26,6 +21,7 @@ from rig.dyno.figures import (
     find_motion,
 )
 from rig.dyno.quality import quality
+from rig.dyno.request import DEFAULT, Request
 from rig.dyno.sensor_faults import find_level_limits, judge_sensors
 from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import (
@@ -54,6 +50,7 @@ class Characteristics:
         corrections: What of lag and drift was removed from its force.
         quality: What in the record may mislead.
         account: The whole record as steps, rests, transitions, and what was rejected and why.
+        curves: Forces at speeds.
     """
 
     record: ForceRecord
@@ -63,6 +60,7 @@ class Characteristics:
     corrections: Corrections
     quality: tuple[str, ...]
     account: tuple[Span, ...]
+    curves: tuple[CurvePoint, ...]
 
     @property
     def name(self) -> str:
@@ -82,6 +80,7 @@ class Characteristics:
             "holds": self.holds,
             "corrections": self.corrections.as_dict(),
             **figures,
+            "curves": self.curves,
             "account": self.account,
             "quality": self.quality,
             "notes": notes,
@@ -89,7 +88,7 @@ class Characteristics:
 
 
 def characterise(
-    path: Path, strut: str | None = None, requested: RequestedCorrections = ALL_CORRECTIONS
+    path: Path, strut: str | None = None, requested: Request = DEFAULT
 ) -> Characteristics:
     """Figures of a damper from a run's folder or a CSV of measured data.
 
@@ -116,9 +115,7 @@ def characterise(
     )
 
 
-def characterise_record(
-    record: ForceRecord, requested: RequestedCorrections = ALL_CORRECTIONS
-) -> Characteristics:
+def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Characteristics:
     """Figures of a damper from its record, without missing values.
 
     Raises:
@@ -141,6 +138,7 @@ def characterise_record(
     if corrections.any:
         record = corrections.apply(record)
         kept, rejected = _compute_steps(record, moving, faults.limits, corrections)
+    kept, rejected = _admit(kept, rejected, requested.warm_c, record.name)
     if not kept:
         raise InputError(
             f"{record.name}: no steady cycle in {len(strokes)} strokes: never three in a row of "
@@ -151,18 +149,55 @@ def characterise_record(
     marked = mark_warm_up([step for _, step in kept])
     spans = account(t_s, strokes, [block for block, _ in kept], rejected, rests)
     warnings = quality(record, marked, spans, faults, corrections)
-    others = [
-        (other, tuple(other.apply(step) for step in marked)) for other in corrections.alternatives()
-    ]
     damper = summarise_damper(marked)
+    others = [(it, tuple(it.apply(step) for step in marked)) for it in corrections.alternatives()]
+    dampers = [(it, summarise_damper(steps)) for it, steps in others]
     # With another knee, friction and gas would be without another damping.
-    dampers = [
-        (other, like)
-        for other, steps in others
-        if (like := summarise_damper(steps)).bent_sides == damper.bent_sides
+    alike = [(it, like) for it, like in dampers if like.bent_sides == damper.bent_sides]
+    curves = [
+        (it, compute_curves(steps, like, requested))
+        for (it, steps), (_, like) in zip(others, dampers, strict=True)
     ]
-    steps, damper = cover(marked, others), cover(damper, dampers)
-    return Characteristics(record, steps, holds, damper, corrections, warnings, spans)
+    return Characteristics(
+        record,
+        cover(marked, others),
+        holds,
+        cover(damper, alike),
+        corrections,
+        warnings,
+        spans,
+        cover(compute_curves(marked, damper, requested), curves),
+    )
+
+
+def _admit(
+    kept: list[tuple[Block, DynoStep]],
+    rejected: dict[int, str],
+    warm_c: tuple[float, float] | None,
+    name: str,
+) -> tuple[list[tuple[Block, DynoStep]], dict[int, str]]:
+    """Steps whose mean temperature is within a window, and the others with the reason."""
+    if warm_c is None:
+        return kept, rejected
+    low_c, high_c = warm_c
+    admitted: list[tuple[Block, DynoStep]] = []
+    for block, step in kept:
+        at_c = step.temperature_c
+        if at_c is None:
+            raise InputError(
+                f"{name}: has no temperature, expected a column temperature_c for --temperature-c"
+            )
+        if low_c <= at_c <= high_c:
+            admitted.append((block, step))
+        else:
+            text = f"at {at_c:.1f} °C, outside {low_c:g} to {high_c:g} °C"
+            rejected |= {stroke.first: text for stroke in block.strokes}
+    if kept and not admitted:
+        raise InputError(
+            f"{name}: no step between {low_c:g} and {high_c:g} °C (--temperature-c); its steps "
+            f"have {', '.join(f'{step.temperature_c:.1f}' for _, step in kept)} °C"
+        )
+    return admitted, rejected
 
 
 def _find_moving(record: ForceRecord, block: Block) -> tuple[Block, BlockMotion | None]:

@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 from rig.dyno.alternatives import Alternative
 from rig.dyno.cell_lag import LONGEST_LAG_S, CellLag, estimate_lag
 from rig.dyno.figures import LOAD_CELL, DynoStep, ForceRecord
+from rig.dyno.request import Request
 from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import Array
 from rig.dyno.zero_drift import ZeroDrift
@@ -29,21 +30,6 @@ _POSSIBLE = (0.25, 0.5, 0.75, 1.0)
 where the lag is the true one, which is at most an eighth of it away from these."""
 
 
-class RequestedCorrections(NamedTuple):
-    """Corrections that a user requests.
-
-    Attributes:
-        zero: Whether a drift of the zero is removed; else there is none.
-        lag_s: The lag of the force; None estimates it from the record.
-    """
-
-    zero: bool = True
-    lag_s: float | None = None
-
-
-ALL_CORRECTIONS = RequestedCorrections()
-
-
 class Corrections(NamedTuple):
     """What was found, and what of it was removed.
 
@@ -54,7 +40,7 @@ class Corrections(NamedTuple):
         removed_lag_s: Lag that was removed, in s; zero if none was.
     """
 
-    requested: RequestedCorrections
+    requested: Request
     drift: ZeroDrift | None
     lag: CellLag | None
     removed_lag_s: float
@@ -155,7 +141,7 @@ class Corrections(NamedTuple):
         return f" (95 %: {low:.3g} to {high:.3g} ms)"
 
 
-NO_CORRECTIONS = Corrections(RequestedCorrections(zero=False, lag_s=0.0), None, None, 0.0)
+NO_CORRECTIONS = Corrections(Request(zero=False, lag_s=0.0), None, None, 0.0)
 
 
 def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
@@ -195,7 +181,7 @@ def _is_narrow(lag: CellLag) -> bool:
 
 
 def decide(
-    requested: RequestedCorrections,
+    requested: Request,
     record: ForceRecord,
     steps: Sequence[DynoStep],
     drift: ZeroDrift | None,

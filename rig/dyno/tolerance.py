@@ -6,7 +6,6 @@ the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -15,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
-from rig.dyno.figures import SIDES, DynoStep, Side
+from rig.dyno.curves import peak_force_at
+from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import Figure
 from rig.files.delimited_text import read_csv_columns
 
@@ -133,44 +133,14 @@ def evaluate_band(steps: Sequence[DynoStep], tolerance: ToleranceBand) -> list[P
     between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
     measured. A warm-up is no step.
     """
-    used = [step for step in steps if step.kind != "warm_up"]
-    ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
     verdicts: list[PointVerdict] = []
     for point in tolerance.points:
         for side in SIDES:
             low, high = getattr(point, f"{side}_low_n"), getattr(point, f"{side}_high_n")
-            force = _force_at(ordered, side, point.velocity_m_per_s)
+            force = peak_force_at(steps, side, point.velocity_m_per_s)
             verdict = _verdict(force, low, high)
             verdicts.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
     return verdicts
-
-
-_SAME = 0.01
-"""Relative distance of a step's speed from a point's up to which it is the point's."""
-
-_STEEPEST = 2.0
-"""Power of the speed with which the force of an orifice rises: no damper's rises faster."""
-
-
-def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | None:
-    sides: list[Side] = [getattr(step, side) for step in ordered]
-    speeds = [item.peak_velocity_m_per_s.value for item in sides]
-    figures = [item.force_at_peak_velocity_n for item in sides]
-    nearest = min(range(len(speeds)), key=lambda index: abs(speeds[index] / speed - 1.0))
-    apart = abs(speeds[nearest] / speed - 1.0)
-    if apart <= _SAME:
-        figure = figures[nearest]
-        more = _STEEPEST * apart * abs(figure.value)
-        method = f"step at {speeds[nearest]:.4g} m/s"
-        return Figure(figure.value, figure.low - more, figure.high + more, method)
-    for (slow, below), (fast, above) in pairwise(zip(speeds, figures, strict=True)):
-        if slow <= speed <= fast:
-            share = (speed - slow) / (fast - slow)
-            value = (1.0 - share) * below.value + share * above.value
-            low, high = min(below.low, above.low), max(below.high, above.high)
-            method = f"between steps at {slow:.3g} and {fast:.3g} m/s"
-            return Figure(value, low, high, method)
-    return None
 
 
 def _verdict(force: Figure | None, low: float, high: float) -> Verdict:

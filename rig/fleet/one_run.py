@@ -24,6 +24,9 @@ from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
+from rig.dyno.curves import peak_force_at
+from rig.dyno.figures import SIDES
+from rig.dyno.request import STANDARD_SPEEDS_M_PER_S
 from rig.fleet.sources import RunSource, printable
 from rig.log.file_names import RUN_FILE
 from rig.machine.installed_versions import version_of
@@ -210,20 +213,33 @@ def _figures(path: Path, recording: Recording) -> list[RunValue]:
     if recording.strut_forces_n is None or recording.heights_m.shape[1] != 1:
         return []
     try:
-        damper = characterise(path).damper
+        found = characterise(path)
     except InputError:
         return []
+    damper = found.damper
     named = {
         "gas_force_n": damper.gas_force_n,
         "gas_rate_n_per_m": damper.gas_rate_n_per_m,
         "friction_n": damper.friction_n,
         "asymmetry": damper.asymmetry,
+        **{
+            f"{side}_force_n_at_{speed:g}_m_per_s": peak_force_at(found.steps, side, speed)
+            for speed in STANDARD_SPEEDS_M_PER_S
+            for side in SIDES
+        },
     }
-    return [
+    figures = [
         RunValue("figure", "", "", "", name, figure.value, figure.low, figure.high)
         for name, figure in named.items()
-        if figure is not None
+        if figure is not None and figure.is_bounded
     ]
+    warm_c = [step.temperature_c for step in found.steps if step.temperature_c is not None]
+    if warm_c:
+        mean_c = sum(warm_c) / len(warm_c)
+        figures.append(
+            RunValue("figure", "", "", "", "temperature_c", mean_c, min(warm_c), max(warm_c))
+        )
+    return figures
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ from rig.fleet.trends import (
 SCALED_BY_FORCE = ("stiffness_n_per_m", "damping_n_s_per_m", "friction_n", "gas_force_n")
 """Values that a load cell's gain multiplies, and the linear model or every damper has."""
 
-_FORCE = re.compile(r"_n(_per_|_s|$)")
+_FORCE = re.compile(r"_n(_per_|_s|_at_|$)")
 """Units of what is proportional to a force: N, N/m, N·s/m, ..."""
 
 _MONTH_DAYS = 365.25 / 12.0

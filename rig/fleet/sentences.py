@@ -26,14 +26,11 @@ def power_sentences(found: Overview) -> list[str]:
 def _power_sentence(power: Power) -> str:
     begin = f"{power.quantity}, {power.runs:g} runs a damper"
     if power.drift_per_month is None:
-        return f"{begin}: no change can be seen, expected runs on three days at least"
+        return f"{begin}: any drift or step, until there are runs on three days"
     drift = f"a drift of less than {100 * power.drift_per_month:.2g} % a month"
     if power.step is None:
-        return (
-            f"{begin}: {drift} cannot be seen, nor any step: it takes {FEWEST} runs, of which "
-            f"{EDGE} after it"
-        )
-    return f"{begin}: {drift} or a step of less than {100 * power.step:.2g} % cannot be seen"
+        return f"{begin}: {drift}; any step, until there are {FEWEST} runs, {EDGE} of them after it"
+    return f"{begin}: {drift}, a step of less than {100 * power.step:.2g} %"
 
 
 def series_name(item: Series | Outlier) -> str:
