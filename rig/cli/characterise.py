@@ -15,7 +15,9 @@ from rig.cli.terminal import (
     LagGiven,
     PrintToo,
     StrutOfRun,
+    TemperatureWindow,
     ZeroFlag,
+    parse_window,
     print_json,
     print_table,
     print_text,
@@ -31,7 +33,8 @@ EXAMPLES = (
     "Examples: `rig characterise dyno.csv` · `rig characterise left.csv right.csv --out found` · "
     "`rig characterise runs/7 --strut suspension` · "
     "`rig characterise dyno.csv --tolerance band.yaml --serial 0815 --out found` · "
-    "`rig characterise 0815.csv --master good.csv`"
+    "`rig characterise 0815.csv --master good.csv` · "
+    "`rig characterise warm.csv --temperature-c 40:60 --speeds 0.05,0.13,0.52 --curves warm.xlsx`"
 )
 
 
@@ -64,6 +67,29 @@ def characterise_command(
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
     lag_ms: LagGiven = None,
+    temperature_c: TemperatureWindow = None,
+    reference_c: Annotated[
+        float | None,
+        typer.Option(
+            metavar="C",
+            help="Temperature at which the forces of the curves are also given, where the record "
+            "determines the change per kelvin.",
+        ),
+    ] = None,
+    speeds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="V,V,...",
+            help="Speeds in m/s at which the curves give forces; without it 0.05 to 1.5 m/s.",
+        ),
+    ] = None,
+    curves: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="New CSV or XLSX file for the curves: forces at speeds with their intervals.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="New folder for characteristics.json and report.html."),
@@ -88,21 +114,23 @@ def characterise_command(
     from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.request import Request
     from rig.dyno.tolerance import load_tolerance
-    from rig.files.folders import refuse_full
+    from rig.formats.curve_table import write_curve_table
     from rig.pages.identity import parse_labels
 
-    if out is not None:
-        refuse_full(out)
-    if pdf:
-        _require_printing(out)
+    _check_outputs(out, curves, junit, pdf=pdf, is_judged=bool(tolerance or master))
     labels = ({"serial": serial} if serial else {}) | parse_labels(label or [])
-    refuse_existing(junit, option=JUNIT)
-    if junit is not None and tolerance is None and master is None:
-        raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    requested = Request(zero, None if lag_ms is None else 1e-3 * lag_ms)
+    requested = Request(
+        zero,
+        None if lag_ms is None else 1e-3 * lag_ms,
+        parse_window(temperature_c, "--temperature-c"),
+        reference_c,
+        _parse_speeds(speeds),
+    )
     reports = evaluate_records(runs, strut, band, master, scatter, requested)
     content = content_of(reports, serial, band)
+    if curves is not None:
+        write_curve_table([report.characteristics for report in reports], curves)
     if out is not None:
         write_content(content, out)
         _write_sheet(reports, out, labels, pdf=pdf)
@@ -114,19 +142,48 @@ def characterise_command(
     else:
         for report in reports:
             _print(report)
+        if curves is not None:
+            print_text(f"Curves: {curves}")
         if out is not None:
             print_text(f"Report: {out / 'report.html'}{' and report.pdf' if pdf else ''}")
     if not all(check.passes for check in checks):
         raise typer.Exit(FAILED)
 
 
-def _require_printing(out: Path | None) -> None:
-    """Refuse printing without a folder or a browser, before the work."""
+def _parse_speeds(text: str | None) -> tuple[float, ...]:
+    """Speeds from a text such as 0.05,0.1."""
+    from rig.dyno.request import STANDARD_SPEEDS_M_PER_S
+
+    if text is None:
+        return STANDARD_SPEEDS_M_PER_S
+    try:
+        speeds = tuple(sorted({float(cell) for cell in text.split(",")}))
+    except ValueError:
+        speeds = ()
+    if not speeds or not all(0.0 < speed <= 100.0 for speed in speeds):
+        raise InputError(f"--speeds {text}: expected speeds in m/s, such as 0.05,0.1,0.3")
+    return speeds
+
+
+def _check_outputs(
+    out: Path | None, curves: Path | None, junit: Path | None, *, pdf: bool, is_judged: bool
+) -> None:
+    """Refuse files that cannot be written, and a report on no verdict, before the work."""
+    from rig.files.folders import refuse_full
+    from rig.formats.curve_table import check_curve_table
     from rig.pages.browser_print import find_browser
 
-    if out is None:
+    if out is not None:
+        refuse_full(out)
+    if curves is not None:
+        check_curve_table(curves)
+    if pdf and out is None:
         raise InputError("--pdf: expected --out DIR, where the report is written")
-    find_browser()
+    if pdf:
+        find_browser()
+    refuse_existing(junit, option=JUNIT)
+    if junit is not None and not is_judged:
+        raise InputError("--junit: expected --tolerance or --master, which it reports on")
 
 
 def _write_sheet(

@@ -12,7 +12,9 @@ from rig.cli.terminal import (
     Labels,
     LagGiven,
     StrutOfRun,
+    TemperatureWindow,
     ZeroFlag,
+    parse_window,
     print_json,
     print_table,
     print_text,
@@ -44,6 +46,7 @@ def compare_command(
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
     lag_ms: LagGiven = None,
+    temperature_c: TemperatureWindow = None,
     tolerance: Annotated[
         Path | None,
         typer.Option(
@@ -88,7 +91,11 @@ def compare_command(
         refuse_full(out)
     band = None if tolerance is None else load_tolerance(tolerance)
     labels = parse_labels(label or [])
-    requested = Request(zero, None if lag_ms is None else 1e-3 * lag_ms)
+    requested = Request(
+        zero,
+        None if lag_ms is None else 1e-3 * lag_ms,
+        parse_window(temperature_c, "--temperature-c"),
+    )
     records = [characterise(path, strut, requested) for path in runs]
     content: dict[str, object] = {"schema": 1}
     if dose:

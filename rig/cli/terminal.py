@@ -1,5 +1,6 @@
 """The terminal: console, tables and JSON of the commands, their common options and exit codes."""
 
+import math
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -48,6 +49,14 @@ LagGiven = Annotated[
         max=20.0,
         help="Time by which the force lags the height, which is removed; 0 if it does not. Without "
         "it, the lag is estimated from the steps.",
+    ),
+]
+TemperatureWindow = Annotated[
+    str | None,
+    typer.Option(
+        "--temperature-c",
+        metavar="LOW:HIGH",
+        help="Use only steps whose mean temperature is in this window, such as 40:60.",
     ),
 ]
 Labels = Annotated[
@@ -106,6 +115,24 @@ def print_text(text: str, style: str = "") -> None:
 def print_json(content: object) -> None:
     """Print as JSON; numbers that are not finite become null."""
     typer.echo(json_text(content), nl=False)
+
+
+def parse_window(text: str | None, option: str) -> tuple[float, float] | None:
+    """Two numbers that increase, such as 40:60.
+
+    Raises:
+        InputError: The text is none.
+    """
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    try:
+        window = float(low), float(high)
+    except ValueError:
+        window = math.nan, math.nan
+    if not window[0] < window[1]:
+        raise InputError(f"{option} {text}: expected LOW:HIGH, such as 40:60")
+    return window
 
 
 def refuse_existing(*paths: Path | None, option: str = "") -> None:

@@ -1,13 +1,14 @@
 """From a recording to the figures of its damper."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from can_dbc.errors import InputError, expected_name
 from rig.dyno.alternatives import cover
+from rig.dyno.build_notes import read_build_notes
 from rig.dyno.corrections import NO_CORRECTIONS, Corrections, decide
 from rig.dyno.curves import CurvePoint, compute_curves
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
@@ -51,6 +52,7 @@ class Characteristics:
         quality: What in the record may mislead.
         account: The whole record as steps, rests, transitions, and what was rejected and why.
         curves: Forces at speeds.
+        build: How the damper was built, by name.
     """
 
     record: ForceRecord
@@ -61,6 +63,7 @@ class Characteristics:
     quality: tuple[str, ...]
     account: tuple[Span, ...]
     curves: tuple[CurvePoint, ...]
+    build: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def name(self) -> str:
@@ -75,6 +78,7 @@ class Characteristics:
             "record": self.name,
             "strut": self.record.strut or None,
             "force": self.record.source,
+            "build": self.build,
             "signs": "positive when the strut pushes: damping of compression positive",
             "steps": [step.figures() for step in self.steps],
             "holds": self.holds,
@@ -95,24 +99,17 @@ def characterise(
     `strut` may be None where a run has only one; the requested corrections are applied.
 
     Raises:
-        InputError: There is no such record, or no cycle in it repeats.
+        InputError: There is no such record, no cycle in it repeats, or its build notes are wrong.
     """
+    build = read_build_notes(path)
     recording = read_recording(path)
     name, height_m, force_n, source = _read_strut(path, recording, strut)
     good = np.isfinite(height_m) & np.isfinite(force_n)
     warm_c = None if recording.temperature_c is None else recording.temperature_c[good]
-    return characterise_record(
-        ForceRecord(
-            recording.name,
-            recording.t_s[good],
-            height_m[good],
-            force_n[good],
-            warm_c,
-            name,
-            source,
-        ),
-        requested,
+    record = ForceRecord(
+        recording.name, recording.t_s[good], height_m[good], force_n[good], warm_c, name, source
     )
+    return replace(characterise_record(record, requested), build=build)
 
 
 def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Characteristics:

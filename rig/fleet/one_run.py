@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import hashlib
+import json
 import math
 import os
 import re
@@ -23,6 +24,7 @@ from dart_model.spec import ModelSpec, parse_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.refit import refit_parameters
+from rig.dyno.build_notes import read_build_notes
 from rig.dyno.characterise import characterise
 from rig.dyno.curves import peak_force_at
 from rig.dyno.figures import SIDES
@@ -60,6 +62,7 @@ class RunRow:
             prescribed motion.
         after: The same of the corrected model.
         floor: What a right model leaves there.
+        build: How the damper was built: notes by name, as JSON; empty without them.
     """
 
     key: str
@@ -73,6 +76,7 @@ class RunRow:
     version: str
     verdict: str = ""
     error: str = ""
+    build: str = ""
     samples: int = 0
     duration_s: float = math.nan
     before: float = math.nan
@@ -163,6 +167,7 @@ def _diagnose_run(source: RunSource, model: FleetModel) -> RunRow:
         names = [strut.name for strut in spec.struts]
         recording = read_recording(path, names)
         figures = _figures(path, recording)
+        build = read_build_notes(path)
         day = source.date or _day_of(path, source) or source.changed
     found = diagnose(spec, [recording]).diagnosis
     own = [
@@ -182,6 +187,7 @@ def _diagnose_run(source: RunSource, model: FleetModel) -> RunRow:
         key=key,
         date=day,
         verdict=found.verdict,
+        build=json.dumps(build, ensure_ascii=False) if build else "",
         samples=len(recording.t_s),
         duration_s=recording.duration_s,
         before=counted.before,

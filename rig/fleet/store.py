@@ -33,7 +33,7 @@ with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is wr
 _TEXT, _REAL = pa.string(), pa.float64()
 _RUN_TEXTS = (
     *("key", "identity", "source", "damper", "model", "model_sha256", "version", "written"),
-    *("verdict", "error"),
+    *("verdict", "error", "build"),
 )
 _RUN_NUMBERS = ("duration_s", "before", "after", "floor", "took_s")
 _RUN = pa.schema(

@@ -86,10 +86,11 @@ def write_characteristics_page(
     first = reports[0]
     standings = [report.standing for report in reports]
     worst = next((it for it in ("fail", "open", "pass") if it in standings), None)
+    build = first.characteristics.build if len(reports) == 1 else dict[str, str]()
     text = render_report(
         "characteristics.html",
         names=[report.characteristics.name for report in reports],
-        identity=identity_rows(labels or {}),
+        identity=identity_rows({**build, **(labels or {})}),
         stamp=None if worst is None else _STAMPS[worst],
         findings=[find(report) for report in reports],
         pictures=draw_damper(reports),

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rig.dyno.build_notes import differing_notes
 from rig.dyno.characterise import Characteristics
 from rig.dyno.comparison import Difference, Match, Trend, list_not_comparable, pair_steps
 from rig.dyno.report import DamperReport
@@ -56,8 +57,11 @@ def write_comparison_page(
 
 
 def notes_on(records: Sequence[Characteristics]) -> list[str]:
-    """What in the records may mislead, each note with its record."""
-    return [f"{record.name}: {note}" for record in records for note in record.quality]
+    """Notes of their build that differ, and what in the records may mislead, with its record."""
+    return [
+        *(f"built differently, {text}" for text in differing_notes([it.build for it in records])),
+        *(f"{record.name}: {note}" for record in records for note in record.quality),
+    ]
 
 
 def summarise_differences(
