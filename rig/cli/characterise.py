@@ -13,6 +13,7 @@ from rig.cli.terminal import (
     JsonFlag,
     Labels,
     LagGiven,
+    MovingMass,
     PrintToo,
     StrutOfRun,
     TemperatureWindow,
@@ -67,6 +68,7 @@ def characterise_command(
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
     lag_ms: LagGiven = None,
+    moving_mass_kg: MovingMass = 0.0,
     temperature_c: TemperatureWindow = None,
     reference_c: Annotated[
         float | None,
@@ -123,6 +125,7 @@ def characterise_command(
     requested = Request(
         zero,
         None if lag_ms is None else 1e-3 * lag_ms,
+        moving_mass_kg,
         parse_window(temperature_c, "--temperature-c"),
         reference_c,
         _parse_speeds(speeds),

@@ -11,6 +11,7 @@ from rig.cli.terminal import (
     JsonFlag,
     Labels,
     LagGiven,
+    MovingMass,
     StrutOfRun,
     TemperatureWindow,
     ZeroFlag,
@@ -46,6 +47,7 @@ def compare_command(
     strut: StrutOfRun = None,
     zero: ZeroFlag = True,
     lag_ms: LagGiven = None,
+    moving_mass_kg: MovingMass = 0.0,
     temperature_c: TemperatureWindow = None,
     tolerance: Annotated[
         Path | None,
@@ -94,6 +96,7 @@ def compare_command(
     requested = Request(
         zero,
         None if lag_ms is None else 1e-3 * lag_ms,
+        moving_mass_kg,
         parse_window(temperature_c, "--temperature-c"),
     )
     records = [characterise(path, strut, requested) for path in runs]

@@ -51,6 +51,16 @@ LagGiven = Annotated[
         "it, the lag is estimated from the steps.",
     ),
 ]
+MovingMass = Annotated[
+    float,
+    typer.Option(
+        "--moving-mass-kg",
+        metavar="KG",
+        min=0.0,
+        max=1000.0,
+        help="Mass between load cell and strut that moves with the strut; its inertia is removed.",
+    ),
+]
 TemperatureWindow = Annotated[
     str | None,
     typer.Option(

@@ -124,11 +124,12 @@ def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Ch
     blocks = find_blocks(t_s, height_m, strokes)
     rests = find_holds(t_s, height_m, blocks)
     moving = [_find_moving(record, block) for block in blocks]
-    kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
+    none = NO_CORRECTIONS._replace(requested=requested._replace(zero=False, lag_s=0.0))
+    kept, rejected = _compute_steps(record, moving, faults.limits, none)
     levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
     if levels != ForceRange():
         faults = faults._replace(limits=faults.limits.within(levels))
-        kept, rejected = _compute_steps(record, moving, faults.limits, NO_CORRECTIONS)
+        kept, rejected = _compute_steps(record, moving, faults.limits, none)
     at_rest = [compute_rest(record, here) for here in rests]
     drift = estimate_drift(record, blocks, at_rest, faults.limits)
     corrections = decide(requested, record, [step for _, step in kept], drift)
@@ -151,6 +152,12 @@ def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Ch
     dampers = [(it, summarise_damper(steps)) for it, steps in others]
     # With another knee, friction and gas would be without another damping.
     alike = [(it, like) for it, like in dampers if like.bent_sides == damper.bent_sides]
+    if requested.reference_c is not None and not any(damper.share_per_kelvin_per_k.values()):
+        warnings = (
+            *warnings,
+            f"no force at {requested.reference_c:g} °C: the record does not determine the change "
+            "per kelvin (one speed over 2 K or more, and a slow step)",
+        )
     curves = [
         (it, compute_curves(steps, like, requested))
         for (it, steps), (_, like) in zip(others, dampers, strict=True)
@@ -218,7 +225,9 @@ def _compute_steps(
     rejected: dict[int, str] = {}
     for block, motion in moving:
         times_s = record.t_s[block.begin : block.end]
-        step = compute_step(record, block, motion, corrections.limits_in(limits, times_s))
+        inside = corrections.limits_in(limits, times_s)
+        mass_kg = corrections.requested.moving_mass_kg
+        step = compute_step(record, block, motion, inside, mass_kg)
         if isinstance(step, str):
             rejected |= {stroke.first: step for stroke in block.strokes}
         else:

@@ -105,10 +105,16 @@ class Corrections(NamedTuple):
             "removes_drift": self.removes_drift,
             "lag_s": None if lag is None else lag.figure,
             "removed_lag_s": self.removed_lag_s,
+            "moving_mass_kg": self.requested.moving_mass_kg,
         }
 
     def words(self) -> Iterator[str]:
         """A sentence on each."""
+        if self.requested.moving_mass_kg:
+            yield (
+                f"the inertia of {self.requested.moving_mass_kg:g} kg between load cell and strut "
+                "was removed from the force"
+            )
         if self.drift is not None and (self.requested.zero or self.drift.kind != "unseen"):
             yield _drift_words(self.drift, removes=self.removes_drift)
         lag = self.lag

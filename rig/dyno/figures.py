@@ -209,18 +209,24 @@ def find_motion(record: ForceRecord, block: Block) -> BlockMotion | None:
 
 
 def compute_step(
-    record: ForceRecord, block: Block, motion: BlockMotion | None, limits: ForceRange
+    record: ForceRecord,
+    block: Block,
+    motion: BlockMotion | None,
+    limits: ForceRange,
+    moving_mass_kg: float = 0.0,
 ) -> DynoStep | str:
     """Figures of a block and its motion, or why it has none.
 
-    The load cell is clipped at the limits.
+    The load cell is clipped at the limits. Between it and the strut moves a mass.
     """
     t_s, warm_c = record.t_s, record.temperature_c
     force_n = _thin(record.force_n, block)
     warm_c = None if warm_c is None else _thin(warm_c, block)
     if motion is None:
         return f"{len(block.strokes)} strokes of one amplitude that do not repeat one motion"
-    velocity = motion.velocity_m_per_s
+    velocity, times_s = motion.velocity_m_per_s, _thin(t_s, block)
+    # The strut accelerates the mass, whichever end it is at, and the cell holds what is left.
+    force_n = force_n + moving_mass_kg * np.gradient(velocity, times_s)
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
     turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
     down, up = (mean_stroke(motion, force_n, turned, sign) for sign in (-1, 1))
@@ -229,7 +235,6 @@ def compute_step(
         return f"{len(block.strokes)} strokes with {samples:.0f} samples a cycle, which are too few"
     strokes = down.clipped_at(limits), up.clipped_at(limits)
     speed_std = motion.velocity_std_m_per_s
-    times_s = _thin(t_s, block)
     down, up = strokes
     sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
     speed = max(side.peak_velocity_m_per_s.value for side in sides)

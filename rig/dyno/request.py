@@ -12,6 +12,7 @@ class Request(NamedTuple):
     Attributes:
         zero: Whether a drift of the zero is removed; else there is none.
         lag_s: The lag of the force; None estimates it from the record.
+        moving_mass_kg: Mass between load cell and strut, which moves with the strut.
         warm_c: Temperatures between which a step is used; None uses all.
         reference_c: Temperature at which forces are also given; None does not.
         speeds_m_per_s: Speeds at which forces are given.
@@ -19,6 +20,7 @@ class Request(NamedTuple):
 
     zero: bool = True
     lag_s: float | None = None
+    moving_mass_kg: float = 0.0
     warm_c: tuple[float, float] | None = None
     reference_c: float | None = None
     speeds_m_per_s: tuple[float, ...] = STANDARD_SPEEDS_M_PER_S

@@ -62,7 +62,7 @@ class Where(NamedTuple):
 
 
 class Visible(NamedTuple):
-    """Changes of a series that are seen with a chance of 90 %.
+    """Changes of a series that are seen with a chance of 95 %.
 
     Attributes:
         drift_per_day: Slope of a straight line.
@@ -121,7 +121,7 @@ class Outlier(NamedTuple):
 
 
 class Power(NamedTuple):
-    """What would be seen of a quantity with a chance of 90 %: medians over the dampers.
+    """What would be seen of a quantity with a chance of 95 %: medians over the dampers.
 
     Attributes:
         dampers: Dampers of which there is a value.

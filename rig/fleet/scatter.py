@@ -6,8 +6,8 @@ own, and these are drawn from one distribution of all dampers, whose two paramet
 moments of the logarithms (empirical Bayes). If the dampers scatter alike, a short series is tested
 with the scatter of all; if they differ, with its own.
 
-A slope, or a step, is seen with a chance of 90 % if it is as large as the critical value of its
-test and the 90 % quantile of the error about it together. What is smaller cannot be relied upon to
+A slope, or a step, is seen with a chance of 95 % if it is as large as the critical value of its
+test and the 95 % quantile of the error about it together. What is smaller cannot be relied upon to
 be seen, and a report without an alarm says nothing of it.
 
 References:
@@ -30,7 +30,7 @@ _FEWEST = 4
 _MOST_FREEDOM = 1e4
 """Degrees of freedom of the common scatter beyond which it is as good as known."""
 
-POWER = 0.9
+POWER = 0.95
 """Chance with which a change that is called visible is seen."""
 
 
@@ -49,7 +49,7 @@ class Scatter(NamedTuple):
         return Scatter(variance, freedom)
 
     def visible_slope(self, squares: float, level: float) -> float:
-        """Slope that a test at a level sees with a chance of 90 %.
+        """Slope that a test at a level sees with a chance of 95 %.
 
         `squares` is the sum of squares of the times about their mean, without what other unknowns
         take of it.

@@ -22,8 +22,9 @@ from rig.fleet.scatter import POWER, Scatter
 Array = NDArray[np.float64]
 Member = TypeVar("Member")
 
-LEVEL = 0.01
-"""Chance of one false alarm of a kind in a whole fleet without any change."""
+LEVEL = 0.0025
+"""Chance of one false alarm of a kind in a whole fleet without any change: of the four kinds, which
+are drift, change-point, outlier and jump of a bench, together one in a hundred."""
 
 FEWEST = 10
 """Points of a series from which on a change-point is looked for."""
@@ -110,7 +111,7 @@ class Drift(NamedTuple):
     squares_days2: float
 
     def visible_per_day(self, level: float) -> float:
-        """Change per day that is seen with a chance of 90 %, at a level of significance."""
+        """Change per day that is seen with a chance of 95 %, at a level of significance."""
         return self.scatter.visible_slope(self.squares_days2, level)
 
 
@@ -158,7 +159,7 @@ def fit_drift(
 
 
 def visible_step(points: Sequence[DatedValue], level: float) -> float | None:
-    """Size of a step in the middle of a series that is seen with a chance of 90 %, at a level.
+    """Size of a step in the middle of a series that is seen with a chance of 95 %, at a level.
 
     None where no change-point is looked for.
     """
