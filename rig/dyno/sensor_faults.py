@@ -49,7 +49,7 @@ _MOST_SPIKES = 20
 _TOP_SHARE, _TOP_STDS = 0.004, 4.0
 """Share of a force, and standard deviations, within which a mean stroke is at its level."""
 
-_SHARES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_SHARES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.94)
 """Shares of the peak speed from which on a force may stay at its level."""
 
 _FEWEST_PLACES, _FEWEST_SAMPLES = 6, 12
@@ -61,7 +61,10 @@ may exceed it: a spline overshoots at a corner."""
 
 _FLAT = 0.1
 """Slope at the level over the slope below it, which a clipped cell stays under with its 95 %
-interval, and which is not above zero with it: above their knee dampers have a tenth to a third."""
+interval: above their knee dampers have a tenth to a third."""
+
+_NOT_ABOVE = 3.0
+"""Standard deviations up to which a slope may be zero: of many steps one is above two by chance."""
 
 _SLOWEST_ENTRY = 0.1
 """Share of a level that the force has to rise by with speed: dry friction is there at once."""
@@ -232,7 +235,9 @@ def _level_of(stroke: MeanStroke) -> _Level | None:
         if top is None or below is None or below.slope <= 0.0:
             continue
         half = 1.96 * top.slope_std
-        is_flat = top.slope <= half and top.slope + half <= _FLAT * below.slope
+        is_flat = (
+            top.slope <= _NOT_ABOVE * top.slope_std and top.slope + half <= _FLAT * below.slope
+        )
         # A level that is reached at no speed is that of dry friction.
         rises = below.slope * share * peak > _SLOWEST_ENTRY * top.level_n
         if (

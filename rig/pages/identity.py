@@ -24,10 +24,12 @@ class IdentityRow(NamedTuple):
 def identity_rows(labels: Mapping[str, str]) -> tuple[IdentityRow, ...]:
     """Rows of the usual fields, then of every other label."""
     names = dict.fromkeys((*FIELDS, *labels))
-    return tuple(
-        IdentityRow(_TITLES.get(name, name[:1].upper() + name[1:]), labels.get(name, ""))
-        for name in names
-    )
+    return tuple(IdentityRow(_title(name), labels.get(name, "")) for name in names)
+
+
+def _title(name: str) -> str:
+    words = name.replace("_", " ")
+    return _TITLES.get(name, words[:1].upper() + words[1:])
 
 
 def parse_labels(texts: Sequence[str]) -> dict[str, str]:

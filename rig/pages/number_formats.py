@@ -22,7 +22,10 @@ def number(value: float, decimals: int) -> str:
 
 def three_digits(value: float) -> str:
     """A number with three digits."""
-    return number(value, 2 - math.floor(math.log10(abs(value)))) if value else "0"
+    if not value:
+        return "0"
+    rounded = float(f"{value:.2e}")  # 0.09996 has the decimals of 0.100
+    return number(value, 2 - math.floor(math.log10(abs(rounded))))
 
 
 def decimals_of(uncertainty: float) -> int:
