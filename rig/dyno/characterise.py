@@ -9,7 +9,7 @@ import numpy as np
 from can_dbc.errors import InputError, expected_name
 from rig.dyno.alternatives import cover
 from rig.dyno.build_notes import read_build_notes
-from rig.dyno.corrections import NO_CORRECTIONS, Corrections, decide
+from rig.dyno.corrections import NO_CORRECTIONS, Corrections, find_lag
 from rig.dyno.curves import CurvePoint, compute_curves
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import (
@@ -132,9 +132,15 @@ def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Ch
         kept, rejected = _compute_steps(record, moving, faults.limits, none)
     at_rest = [compute_rest(record, here) for here in rests]
     drift = estimate_drift(record, blocks, at_rest, faults.limits)
-    corrections = decide(requested, record, [step for _, step in kept], drift)
-    if corrections.any:
-        record = corrections.apply(record)
+    corrections = Corrections(requested, drift, None, 0.0)
+    if corrections.removes_drift:
+        without = corrections.apply(record)
+        kept, rejected = _compute_steps(without, moving, faults.limits, corrections)
+    corrections = find_lag(corrections, record, [step for _, step in kept])
+    if requested.lag_s is not None:
+        corrections = corrections._replace(removed_lag_s=requested.lag_s)
+    record = corrections.apply(record)
+    if corrections.removed_lag_s:
         kept, rejected = _compute_steps(record, moving, faults.limits, corrections)
     kept, rejected = _admit(kept, rejected, requested.warm_c, record.name)
     if not kept:

@@ -75,11 +75,6 @@ class Corrections(NamedTuple):
             ends = (end for end in (min(lag.figure.low, 0.0), lag.figure.high) if end)
             yield from (Alternative(share * end, None, True) for end in ends for share in _POSSIBLE)
 
-    @property
-    def any(self) -> bool:
-        """Whether anything is removed."""
-        return self.removes_drift or self.removed_lag_s != 0.0
-
     def apply(self, record: ForceRecord) -> ForceRecord:
         """The record without what is removed."""
         force_n = record.force_n
@@ -186,20 +181,14 @@ def _is_narrow(lag: CellLag) -> bool:
     return size <= LONGEST_LAG_S and lag.figure.half <= max(_KNOWN_SHARE * size, _KNOWN_S)
 
 
-def decide(
-    requested: Request,
-    record: ForceRecord,
-    steps: Sequence[DynoStep],
-    drift: ZeroDrift | None,
+def find_lag(
+    corrections: Corrections, record: ForceRecord, steps: Sequence[DynoStep]
 ) -> Corrections:
-    """What is removed from a record, whose steps were computed without it."""
-    found = Corrections(requested, drift, None, requested.lag_s or 0.0)
+    """The corrections of a record with its lag, whose steps have no drift but the lag."""
     if record.source != LOAD_CELL:
-        return found
-    if drift is not None and found.removes_drift:
-        steps = [Alternative(drift_n=drift.at).apply(step) for step in steps]
+        return corrections
     lag = estimate_lag(steps)
-    if requested.lag_s is None and lag is not None and lag.kind == "one":
+    if corrections.requested.lag_s is None and lag is not None and lag.kind == "one":
         lag_s = lag.figure.value if _is_narrow(lag) and _is_seen(lag) else 0.0
-        return found._replace(lag=lag, removed_lag_s=lag_s)
-    return found._replace(lag=lag)
+        return corrections._replace(lag=lag, removed_lag_s=lag_s)
+    return corrections._replace(lag=lag)

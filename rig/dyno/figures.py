@@ -54,6 +54,9 @@ _RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
 _ANGLE_NODES, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
 """Angles and weights of an integral over a stroke."""
 
+_INNER = 0.9
+"""Share of the stroke over which the spring rate is taken: at its ends friction reverses."""
+
 _MOST_A_CYCLE = 1600
 """Samples of a cycle beyond which means of several are taken: within a quarter of a degree a force
 is straight, and the means have what the samples said."""
@@ -354,9 +357,8 @@ def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: flo
 
 def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[Array, MeanStroke]]:
     """The spring rate as rows: the least-squares slope of both strokes' mean, with its sign."""
-    inside = np.abs(_ANGLE_NODES) <= np.arcsin(0.9)
-    angles = _ANGLE_NODES[inside]
-    u, w = np.sin(angles), (_WEIGHT * np.cos(_ANGLE_NODES))[inside]
+    angles = float(np.arcsin(_INNER)) * _RULE[0]
+    u, w = np.sin(angles), _RULE[1] * np.cos(angles)
     slope = w * u / float(np.sum(w * u * u))
     return [
         (-0.5 * item.sign / item.amplitude_m * (slope @ item.row(angles)), item)

@@ -113,7 +113,8 @@ def test_air_in_the_oil_is_no_lag(give_m_per_n):
 
 def test_a_record_without_lag_and_drift_is_left_as_it_is():
     found = characterised(usual())
-    assert not found.corrections.any
+    assert not found.corrections.removes_drift
+    assert found.corrections.removed_lag_s == 0.0
     assert not found.quality
 
 
