@@ -244,7 +244,7 @@ def report_command(
 
 
 def _print(whole: "Overview") -> None:
-    from rig.fleet.sentences import alarm_sentences, power_sentences
+    from rig.fleet.sentences import alarm_sentences, power_rows
 
     print_text(whole.words)
     rows = [
@@ -254,7 +254,9 @@ def _print(whole: "Overview") -> None:
     print_table(("bench", "verdicts"), rows)
     for line in alarm_sentences(whole) or ["Nothing changed, drifts or stands out."]:
         print_text(f"- {line}")
-    for line in power_sentences(whole):
-        print_text(f"- not to be seen: {line}", style="dim")
+    powers = [(escape(row.quantity), row.runs, row.drift, row.step) for row in power_rows(whole)]
+    if powers:
+        heads = ("cannot be seen", "runs of a damper", "drift", "step")
+        print_table(heads, powers)
     for error, count in list(whole.failed.items())[:5]:
         print_text(f"failed, {count}: {error}", style="red")

@@ -1,6 +1,8 @@
 """What a store says, in sentences."""
 
-from rig.fleet.overview import Jump, Outlier, Overview, Power, Series, date_of
+from typing import NamedTuple
+
+from rig.fleet.overview import Jump, Outlier, Overview, Series, date_of
 from rig.fleet.trends import EDGE, FEWEST, ChangePoint, Drift
 
 
@@ -18,19 +20,39 @@ def alarm_sentences(found: Overview) -> list[str]:
     return lines
 
 
-def power_sentences(found: Overview) -> list[str]:
-    """A sentence for each quantity on the changes that cannot be seen in it."""
-    return [_power_sentence(power) for power in found.powers()]
+class PowerRow(NamedTuple):
+    """What cannot be seen of a quantity, in words: scatter from run to run, drift and step."""
+
+    quantity: str
+    dampers: int
+    runs: str
+    scatter: str
+    drift: str
+    step: str
 
 
-def _power_sentence(power: Power) -> str:
-    begin = f"{power.quantity}, {power.runs:g} runs a damper"
-    if power.drift_per_month is None:
-        return f"{begin}: any drift or step, until there are runs on three days"
-    drift = f"a drift of less than {100 * power.drift_per_month:.2g} % a month"
-    if power.step is None:
-        return f"{begin}: {drift}; any step, until there are {FEWEST} runs, {EDGE} of them after it"
-    return f"{begin}: {drift}, a step of less than {100 * power.step:.2g} %"
+def power_rows(found: Overview) -> list[PowerRow]:
+    """A row for each quantity."""
+    return [
+        PowerRow(
+            power.quantity,
+            power.dampers,
+            f"{power.runs:g}",
+            _percent(power.scatter, "–"),
+            _percent(power.drift_per_month, "any, three days needed", "< ", " a month"),
+            _percent(power.step, f"any, {FEWEST} runs needed, {EDGE} after it", "< "),
+        )
+        for power in found.powers()
+    ]
+
+
+def _percent(share: float | None, unknown: str, before: str = "", after: str = "") -> str:
+    """A share in per cent with two digits, or what is said where it is not known."""
+    if share is None:
+        return unknown
+    percent = 100.0 * share
+    digits = f"{percent:.0f}" if percent >= 10.0 else f"{percent:.2g}"
+    return f"{before}{digits} %{after}"
 
 
 def series_name(item: Series | Outlier) -> str:

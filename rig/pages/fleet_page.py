@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rig.files.pictures import AutoDateLocator, ConciseDateFormatter, new_figure
 from rig.fleet.overview import Overview, Series
-from rig.fleet.sentences import alarm_sentences, series_name
+from rig.fleet.sentences import alarm_sentences, power_rows, series_name
 from rig.pages.html import render_report, svg_url, write_page
 
 _MOST = 12
@@ -32,6 +32,7 @@ def write_fleet_page(overview: Overview, path: Path) -> None:
         alarms=alarm_sentences(overview),
         verdicts=verdicts,
         overview=overview,
+        powers=power_rows(overview),
         pictures=[(series_name(item), _picture(overview, item)) for item in drawn[:_MOST]],
         left_out=max(0, len(drawn) - _MOST),
     )

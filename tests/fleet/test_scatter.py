@@ -10,7 +10,7 @@ from rig.fleet import store
 from rig.fleet.one_run import RunRow, RunValue
 from rig.fleet.overview import read_overview
 from rig.fleet.scatter import POWER, Scatter, common_scatter
-from rig.fleet.sentences import alarm_sentences, power_sentences
+from rig.fleet.sentences import alarm_sentences, power_rows
 from rig.fleet.trends import DatedValue, fit_drift
 from rig.pages.fleet_page import write_fleet_page
 from tests.fleet.population import FIRST
@@ -99,8 +99,10 @@ def test_what_cannot_be_seen_is_said(tmp_path, months):
     found = read_overview(tmp_path)
     assert alarm_sentences(found) == []
     [power] = found.powers()
-    [sentence] = power_sentences(found)
-    assert f"{months} runs a damper" in sentence
+    [row] = power_rows(found)
+    assert row.runs == str(months)
+    assert row.drift.startswith("any") == (months < 3)
+    assert row.step.startswith("any, 10 runs needed") == (months < 10)
     assert (power.drift_per_month is None) == (months < 3)
     assert (power.step is None) == (months < 10)
     if months == 12:
