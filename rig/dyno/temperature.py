@@ -44,10 +44,16 @@ def widen(figure: Figure, per_k: float, apart_k: float) -> Figure:
 
 
 class Warming(NamedTuple):
-    """Change of a force per kelvin, and the mean of the forces that it is of."""
+    """Change of a force per kelvin.
+
+    Attributes:
+        mean_n: Mean of the forces.
+        squares_k2: Sum of squares of the temperatures about their mean.
+    """
 
     slope: Figure
     mean_n: float
+    squares_k2: float
 
     def share(self, gas: Figure) -> Figure:
         """The change over the force without gas."""
@@ -66,7 +72,8 @@ def change_per_kelvin(steps: Sequence[DynoStep], index: int) -> Warming | None:
         else:
             alike.append(step)
     found = [slope for group in groups if (slope := _slope(group, index)) is not None]
-    return min(found, key=lambda it: it.slope.high - it.slope.low, default=None)
+    # Not the one with the narrowest interval: that is narrow by chance as well.
+    return max(found, key=lambda it: it.squares_k2, default=None)
 
 
 def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
@@ -91,4 +98,4 @@ def _slope(group: Sequence[DynoStep], index: int) -> Warming | None:
     speed = group[0].peak_speed_m_per_s
     text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
     figure = Figure.around(slope, half, text)
-    return Warming(figure, float(forces.mean()))
+    return Warming(figure, float(forces.mean()), float(about @ about))
