@@ -114,7 +114,7 @@ def characterise_command(
     damper agrees with the master in all steps of the master's record.
     """
     from rig.dyno.report import content_of, evaluate_records, write_content
-    from rig.dyno.request import Request
+    from rig.dyno.request import FigureRequest
     from rig.dyno.tolerance import load_tolerance
     from rig.formats.curve_table import write_curve_table
     from rig.pages.identity import parse_labels
@@ -122,7 +122,7 @@ def characterise_command(
     _check_outputs(out, curves, junit, pdf=pdf, is_judged=bool(tolerance or master))
     labels = ({"serial": serial} if serial else {}) | parse_labels(label or [])
     band = None if tolerance is None else load_tolerance(tolerance)
-    requested = Request(
+    requested = FigureRequest(
         zero,
         None if lag_ms is None else 1e-3 * lag_ms,
         moving_mass_kg,

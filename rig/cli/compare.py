@@ -71,7 +71,7 @@ def compare_command(
     """
     from rig.dyno.characterise import characterise
     from rig.dyno.comparison import compare_dampers, match_in_band, trends_over_dose
-    from rig.dyno.request import Request
+    from rig.dyno.request import FigureRequest
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
     from rig.pages.comparison_page import (
@@ -93,7 +93,7 @@ def compare_command(
         refuse_full(out)
     band = None if tolerance is None else load_tolerance(tolerance)
     labels = parse_labels(label or [])
-    requested = Request(
+    requested = FigureRequest(
         zero,
         None if lag_ms is None else 1e-3 * lag_ms,
         moving_mass_kg,

@@ -10,8 +10,9 @@ the odd part of a stroke's force about mid-stroke is the spring's alone,
 k and k3 the same in all steps, and k not negative. The lag is where weighted least squares over all
 steps leave least, its interval where they leave little more.
 
-With few steps, a lag cannot be told from a spring, or from a force with memory, such as that of a
-friction damper. Known is then only the largest lag: with more of it, the spring would push upwards.
+With few steps, a lag cannot be distinguished from a spring, or from a force with memory, such as
+that of a friction damper. Known is then only the largest lag: with more of it, the spring would
+push upwards.
 
 A column of oil with air in it, or a soft mount, delays the force as well, but not by one time in
 all steps: it is the longer, the steeper the damping is. Where the steps contradict one lag by more

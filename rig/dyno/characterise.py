@@ -9,7 +9,7 @@ import numpy as np
 from can_dbc.errors import InputError, expected_name
 from rig.dyno.alternatives import cover
 from rig.dyno.build_notes import read_build_notes
-from rig.dyno.corrections import NO_CORRECTIONS, Corrections, find_lag
+from rig.dyno.corrections import Corrections, find_lag
 from rig.dyno.curves import CurvePoint, compute_curves
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import (
@@ -22,7 +22,7 @@ from rig.dyno.figures import (
     find_motion,
 )
 from rig.dyno.quality import quality
-from rig.dyno.request import DEFAULT, Request
+from rig.dyno.request import DEFAULT, FigureRequest
 from rig.dyno.sensor_faults import find_level_limits, judge_sensors
 from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import (
@@ -92,7 +92,7 @@ class Characteristics:
 
 
 def characterise(
-    path: Path, strut: str | None = None, requested: Request = DEFAULT
+    path: Path, strut: str | None = None, requested: FigureRequest = DEFAULT
 ) -> Characteristics:
     """Figures of a damper from a run's folder or a CSV of measured data.
 
@@ -112,7 +112,7 @@ def characterise(
     return replace(characterise_record(record, requested), build=build)
 
 
-def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Characteristics:
+def characterise_record(record: ForceRecord, requested: FigureRequest = DEFAULT) -> Characteristics:
     """Figures of a damper from its record, without missing values.
 
     Raises:
@@ -124,7 +124,7 @@ def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Ch
     blocks = find_blocks(t_s, height_m, strokes)
     rests = find_holds(t_s, height_m, blocks)
     moving = [_find_moving(record, block) for block in blocks]
-    none = NO_CORRECTIONS._replace(requested=requested._replace(zero=False, lag_s=0.0))
+    none = Corrections(requested, None, None, 0.0)
     kept, rejected = _compute_steps(record, moving, faults.limits, none)
     levels = find_level_limits([stroke for _, step in kept for stroke in step.strokes])
     if levels != ForceRange():
@@ -132,13 +132,11 @@ def characterise_record(record: ForceRecord, requested: Request = DEFAULT) -> Ch
         kept, rejected = _compute_steps(record, moving, faults.limits, none)
     at_rest = [compute_rest(record, here) for here in rests]
     drift = estimate_drift(record, blocks, at_rest, faults.limits)
-    corrections = Corrections(requested, drift, None, 0.0)
+    corrections = none._replace(drift=drift)
     if corrections.removes_drift:
         without = corrections.apply(record)
         kept, rejected = _compute_steps(without, moving, faults.limits, corrections)
     corrections = find_lag(corrections, record, [step for _, step in kept])
-    if requested.lag_s is not None:
-        corrections = corrections._replace(removed_lag_s=requested.lag_s)
     record = corrections.apply(record)
     if corrections.removed_lag_s:
         kept, rejected = _compute_steps(record, moving, faults.limits, corrections)

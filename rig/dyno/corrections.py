@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from rig.dyno.alternatives import Alternative
 from rig.dyno.cell_lag import LONGEST_LAG_S, CellLag, estimate_lag
 from rig.dyno.figures import LOAD_CELL, DynoStep, ForceRecord
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from rig.dyno.stroke_force import ForceRange
 from rig.dyno.strokes import Array
 from rig.dyno.zero_drift import ZeroDrift
@@ -40,7 +40,7 @@ class Corrections(NamedTuple):
         removed_lag_s: Lag that was removed, in s; zero if none was.
     """
 
-    requested: Request
+    requested: FigureRequest
     drift: ZeroDrift | None
     lag: CellLag | None
     removed_lag_s: float
@@ -130,9 +130,9 @@ class Corrections(NamedTuple):
             )
         elif lag is not None and lag.kind == "open" and lag.figure.high >= _LEAST_LAG_S:
             yield (
-                f"a lag of the force of up to {1e3 * lag.figure.high:.3g} ms cannot be told from a "
-                "spring, as the steps have fewer than three frequencies: it is in the intervals. "
-                "State a known one by `--lag-ms`, 0 if there is none"
+                f"a lag of the force of up to {1e3 * lag.figure.high:.3g} ms cannot be "
+                "distinguished from a spring, as the steps have fewer than three frequencies: it "
+                "is in the intervals. State a known one by `--lag-ms`, 0 if there is none"
             )
 
     def _interval(self) -> str:
@@ -140,9 +140,6 @@ class Corrections(NamedTuple):
             return ""
         low, high = 1e3 * self.lag.figure.low, 1e3 * self.lag.figure.high
         return f" (95 %: {low:.3g} to {high:.3g} ms)"
-
-
-NO_CORRECTIONS = Corrections(Request(zero=False, lag_s=0.0), None, None, 0.0)
 
 
 def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
@@ -165,7 +162,7 @@ def _drift_words(drift: ZeroDrift, *, removes: bool) -> str:
     )
     if drift.kind == "excluded":
         return f"{rests} (the cycles between do not show it; nothing is removed)"
-    return f"{rests} (the cycles between do not tell; the intervals contain both)"
+    return f"{rests} (the cycles between leave it open; the intervals contain both)"
 
 
 def _is_seen(lag: CellLag) -> bool:
@@ -185,10 +182,9 @@ def find_lag(
     corrections: Corrections, record: ForceRecord, steps: Sequence[DynoStep]
 ) -> Corrections:
     """The corrections of a record with its lag, whose steps have no drift but the lag."""
-    if record.source != LOAD_CELL:
-        return corrections
-    lag = estimate_lag(steps)
-    if corrections.requested.lag_s is None and lag is not None and lag.kind == "one":
+    stated_s = corrections.requested.lag_s
+    lag = estimate_lag(steps) if record.source == LOAD_CELL else None
+    lag_s = stated_s or 0.0
+    if stated_s is None and lag is not None and lag.kind == "one":
         lag_s = lag.figure.value if _is_narrow(lag) and _is_seen(lag) else 0.0
-        return corrections._replace(lag=lag, removed_lag_s=lag_s)
-    return corrections._replace(lag=lag)
+    return corrections._replace(lag=lag, removed_lag_s=lag_s)

@@ -14,9 +14,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rig.dyno.damper import Damper, spring_curve
+from rig.dyno.damper import Damper, find_slowest, spring_curve
 from rig.dyno.figures import SIDES, DynoStep, Side
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from rig.dyno.stroke_force import ANGLES, Figure
 
 Part = Literal["peak", "opening", "closing"]
@@ -83,11 +83,10 @@ def peak_force_at(steps: Sequence[DynoStep], side: str, speed: float) -> Figure 
 
 
 def compute_curves(
-    steps: Sequence[DynoStep], damper: Damper, request: Request
+    steps: Sequence[DynoStep], damper: Damper, request: FigureRequest
 ) -> tuple[CurvePoint, ...]:
     """Points of both curves at the requested speeds, as far as the steps reach."""
-    slow = [step for step in steps if step.kind == "quasi_static"]
-    slowest = min(slow, key=lambda step: step.peak_speed_m_per_s, default=None)
+    slowest = find_slowest(steps)
     spring = None if slowest is None else spring_curve(slowest)
     points: list[CurvePoint] = []
     for index, side in enumerate(SIDES):

@@ -76,8 +76,7 @@ class Damper(NamedTuple):
 def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper from its steps, in time; one at least."""
     notes: list[str] = []
-    slow = [step for step in steps if step.kind == "quasi_static"]
-    slowest = min(slow, key=lambda step: step.peak_speed_m_per_s, default=None)
+    slowest = find_slowest(steps)
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
     usual = [step for step in steps if step.kind != "warm_up"] or steps
     spring = None if slowest is None else spring_curve(slowest)
@@ -191,6 +190,12 @@ def _less(figure: Figure, bleed_n: float, half_n: float) -> Figure:
     half = float(np.hypot(figure.half, half_n))
     method = f"{figure.method}, less {bleed_n:.2g} N of damping there"
     return Figure.around(value, half, method)
+
+
+def find_slowest(steps: Sequence[DynoStep]) -> DynoStep | None:
+    """The slowest quasi-static step, if there is one."""
+    slow = [step for step in steps if step.kind == "quasi_static"]
+    return min(slow, key=lambda step: step.peak_speed_m_per_s, default=None)
 
 
 def spring_curve(step: DynoStep) -> np.polynomial.Polynomial:

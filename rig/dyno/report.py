@@ -9,7 +9,7 @@ from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics, characterise
 from rig.dyno.faults import MasterComparison, name_faults
 from rig.dyno.master import master_of
-from rig.dyno.request import DEFAULT, Request
+from rig.dyno.request import DEFAULT, FigureRequest
 from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
 from rig.files.json_text import json_text
 
@@ -80,7 +80,7 @@ def evaluate_records(
     band: ToleranceBand | None,
     master: Path | None,
     scatter: float,
-    requested: Request = DEFAULT,
+    requested: FigureRequest = DEFAULT,
 ) -> list[DamperReport]:
     """Reports of several records, folders of runs or CSV files, against a band and a master.
 

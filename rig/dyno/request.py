@@ -6,7 +6,7 @@ STANDARD_SPEEDS_M_PER_S = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
 """Speeds at which forces are given where none are requested."""
 
 
-class Request(NamedTuple):
+class FigureRequest(NamedTuple):
     """Corrections, steps that are admitted, and what the curves are given at.
 
     Attributes:
@@ -26,4 +26,4 @@ class Request(NamedTuple):
     speeds_m_per_s: tuple[float, ...] = STANDARD_SPEEDS_M_PER_S
 
 
-DEFAULT = Request()
+DEFAULT = FigureRequest()

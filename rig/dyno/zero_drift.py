@@ -62,7 +62,7 @@ class ZeroDrift(NamedTuple):
         begin_s: First time at which it is known; straight before.
         end_s: Last time; straight afterwards.
         largest: Change from its begin to where it is largest.
-        kind: `known`: it may be removed; `open`: rests show it, and the cycles do not tell whether
+        kind: `known`: it may be removed; `open`: rests show it, and the cycles leave open whether
             it is one; `excluded`: rests show it, and the cycles that it is none; `unseen`: it is
             not certain, and line and deviations say how large it may be.
         source: What shows it, as a phrase.

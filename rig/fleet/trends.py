@@ -99,7 +99,8 @@ class Drift(NamedTuple):
         level: Value of the line in the middle.
         p: Chance of a slope as large without a drift.
         scatter: Scatter about the line.
-        squares_days2: Sum of squares of the days about their mean, as far as they tell the slope.
+        squares_days2: Sum of squares of the days about their mean, as far as they determine the
+            slope.
     """
 
     per_day: float

@@ -18,7 +18,7 @@ import numpy as np
 from rig.dyno.characterise import ForceRecord, characterise_record
 from rig.dyno.faults import name_faults
 from rig.dyno.master import master_of
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from tests.evidence import add_page_option, command_line, table, write_evidence
 
 RATE_HZ, AMPLITUDE_M, MIDDLE_M = 250.0, 0.025, 0.35
@@ -180,7 +180,7 @@ def with_play(damper, x, v, dt):
 def characterised(damper, seed):
     return characterise_record(
         ForceRecord(f"damper {seed}", *record(damper, np.random.default_rng(seed))),
-        Request(lag_s=0.0),  # as beside a master whose load cell does not lag
+        FigureRequest(lag_s=0.0),  # as beside a master whose load cell does not lag
     )
 
 

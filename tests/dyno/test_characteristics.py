@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from can_dbc.errors import InputError
 from rig.cli.main import app
 from rig.dyno.characterise import ForceRecord, characterise, characterise_record
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from rig.dyno.strokes import find_blocks, find_holds, find_strokes
 from tests.dyno.__main__ import coverage, study
 from tests.dyno.dynos import Dyno, drawn
@@ -78,7 +78,7 @@ def whole_test(seed=1, noise_n=2.0):
 @pytest.fixture(scope="module")
 def tested():
     # It has one rest: a drift, which two would show, is taken for none.
-    requested = Request(zero=False)
+    requested = FigureRequest(zero=False)
     return characterise_record(ForceRecord("whole", *whole_test()), requested)
 
 

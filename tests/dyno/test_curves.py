@@ -10,7 +10,7 @@ from can_dbc.errors import InputError
 from rig.dyno.build_notes import differing_notes, read_build_notes
 from rig.dyno.characterise import characterise, characterise_record
 from rig.dyno.figures import ForceRecord
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from rig.formats.curve_table import COLUMNS, write_curve_table
 from tests.dyno.days import usual
 from tests.dyno.population import gas, law
@@ -30,7 +30,7 @@ def record_of(made, seed=4):
 
 @pytest.fixture(scope="module")
 def found():
-    request = Request(reference_c=22.0, speeds_m_per_s=(0.05, 0.1, 0.3, 2.0))
+    request = FigureRequest(reference_c=22.0, speeds_m_per_s=(0.05, 0.1, 0.3, 2.0))
     return characterise_record(record_of(day()), request)
 
 
@@ -62,7 +62,7 @@ def test_a_force_at_the_reference_temperature_is_the_cold_one(found):
 
 
 def test_a_record_of_one_temperature_gives_none_at_another():
-    cold = characterise_record(record_of(usual(rate_hz=500.0)), Request(reference_c=60.0))
+    cold = characterise_record(record_of(usual(rate_hz=500.0)), FigureRequest(reference_c=60.0))
     assert all(point.at_reference_n is None for point in cold.curves)
     assert "no force at 60 °C" in " ".join(cold.quality)
 
@@ -70,14 +70,14 @@ def test_a_record_of_one_temperature_gives_none_at_another():
 def test_steps_outside_a_temperature_window_are_rejected_with_their_temperature(found):
     warm_c = [step.temperature_c for step in found.steps]
     limit_c = 0.5 * (warm_c[0] + warm_c[1])
-    gated = characterise_record(record_of(day()), Request(warm_c=(limit_c, 90.0)))
+    gated = characterise_record(record_of(day()), FigureRequest(warm_c=(limit_c, 90.0)))
     assert len(gated.steps) == sum(at_c > limit_c for at_c in warm_c) < len(warm_c)
     assert f"at {warm_c[0]:.1f} °C, outside" in " ".join(gated.quality)
     with pytest.raises(InputError, match="no step between 80 and 90"):
-        characterise_record(record_of(day()), Request(warm_c=(80.0, 90.0)))
+        characterise_record(record_of(day()), FigureRequest(warm_c=(80.0, 90.0)))
     cold = record_of(day())._replace(temperature_c=None)
     with pytest.raises(InputError, match="has no temperature"):
-        characterise_record(cold, Request(warm_c=(10.0, 90.0)))
+        characterise_record(cold, FigureRequest(warm_c=(10.0, 90.0)))
 
 
 @pytest.mark.parametrize("mass_kg", [0.5, 3.0])
@@ -88,10 +88,10 @@ def test_the_inertia_between_cell_and_strut_is_removed(mass_kg):
     acceleration = np.gradient(made.motion(t_s)[1], t_s)
     held_n = force_n - mass_kg * np.where(np.abs(acceleration) < 100.0, acceleration, 0.0)
     record = ForceRecord("moved", t_s, height_m, held_n)
-    request = Request(moving_mass_kg=mass_kg, lag_s=0.0)
+    request = FigureRequest(moving_mass_kg=mass_kg, lag_s=0.0)
     right, raw = (
         characterise_record(record, request),
-        characterise_record(record, Request(lag_s=0.0)),
+        characterise_record(record, FigureRequest(lag_s=0.0)),
     )
     x_m = np.linspace(-0.9, 0.9, 2001) * made.steps[0].amplitude_m
     rate = -float(np.polyfit(x_m, gas(made.damper, x_m), 1)[0])

@@ -9,7 +9,7 @@ import pytest
 from can_dbc.errors import InputError
 from rig.dyno.characterise import characterise_record
 from rig.dyno.figures import ForceRecord
-from rig.dyno.request import Request
+from rig.dyno.request import FigureRequest
 from tests.dyno import days
 from tests.dyno.days import Step
 from tests.dyno.many_days import rate_of
@@ -97,7 +97,7 @@ def test_a_lag_of_the_cell_is_found_and_removed(lag_s):
     assert_right(found, day, wider_n=0.5)
     rates = [step.spring_rate_n_per_m for step in found.steps]
     assert max(rate.value for rate in rates) < 1.01 * min(rate.value for rate in rates)
-    kept = characterised(day, Request(lag_s=0.0))
+    kept = characterised(day, FigureRequest(lag_s=0.0))
     assert kept.corrections.removed_lag_s == 0.0
     assert "not removed" in " ".join(kept.quality)
     shown = [step.spring_rate_n_per_m.value for step in kept.steps]
@@ -127,7 +127,7 @@ def test_a_drift_of_the_zero_is_removed(drift_n, lag_s):
     assert found.corrections.drift.largest.value == pytest.approx(drift_n, rel=0.05)
     # What the zero is at the first rest is not known.
     assert_right(found, day, wider_n=0.01 * abs(drift_n))
-    kept = characterised(day, Request(zero=False))
+    kept = characterised(day, FigureRequest(zero=False))
     assert not kept.corrections.removes_drift
     assert ": not removed" in " ".join(kept.quality)
 
@@ -147,7 +147,7 @@ def test_friction_that_holds_another_way_is_no_drift():
 @pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.006])
 @pytest.mark.parametrize("speeds", [(0.4,), (0.1, 0.4)])
 def test_a_lag_that_few_steps_do_not_determine_is_in_the_intervals(lag_s, speeds):
-    """One step does not tell a spring from a lag: both figures contain their true values."""
+    """One step does not distinguish a spring from a lag: both figures contain their true values."""
     steps = tuple(Step(0.025, speed, 8) for speed in speeds)
     day = replace(usual(lag_s=lag_s), steps=steps)
     found = characterised(day)
@@ -160,7 +160,7 @@ def test_a_lag_that_few_steps_do_not_determine_is_in_the_intervals(lag_s, speeds
     for step in found.steps:
         rate = step.spring_rate_n_per_m
         assert 0.999 * rate.low <= rate_n_per_m <= 1.001 * rate.high
-    stated = characterised(day, Request(lag_s=lag_s))
+    stated = characterised(day, FigureRequest(lag_s=lag_s))
     assert_right(stated, day, wider_n=0.5)
     widths = [
         [step.compression.force_at_peak_velocity_n.half for step in it.steps]
@@ -177,7 +177,7 @@ def test_a_drift_that_no_rest_shows_is_in_the_intervals(drift_n):
     assert found.corrections.drift.kind == "unseen"
     assert "without two rests at one height" in " ".join(found.quality)
     assert_right(found, day, wider_n=0.0)
-    stated = characterised(day, Request(zero=False))
+    stated = characterised(day, FigureRequest(zero=False))
     width_n, known_n = (
         it.steps[0].compression.force_at_peak_velocity_n.half for it in (found, stated)
     )
