@@ -19,6 +19,7 @@ class Dimension(Enum):
     VELOCITY = "m/s"
     ACCELERATION = "m/s^2"
     FORCE = "N"
+    TORQUE = "N*m"
     STIFFNESS = "N/m"
     DAMPING = "N*s/m"
     TEMPERATURE = "degC"
@@ -49,6 +50,9 @@ _SPELLINGS: dict[tuple[Dimension, str], str] = {
     (Dimension.TEMPERATURE, "F"): "degF",
     (Dimension.TEMPERATURE, "deg C"): "degC",
     (Dimension.TEMPERATURE, "deg F"): "degF",
+    (Dimension.TORQUE, "Nm"): "N*m",
+    (Dimension.TORQUE, "mNm"): "mN*m",
+    (Dimension.TORQUE, "kNm"): "kN*m",
     (Dimension.DAMPING, "Ns/m"): "N*s/m",
     (Dimension.DAMPING, "Ns/mm"): "N*s/mm",
     (Dimension.DAMPING, "kNs/m"): "kN*s/m",

@@ -36,8 +36,11 @@ class LoadedModel(Protocol[StateT_co]):
         ...
 
     @property
-    def applied_force_n(self) -> float:
-        """Applied force."""
+    def inputs(self) -> Sequence[float]:
+        """Input vector: forces (N), torques (N·m), and of motions position, velocity, acceleration.
+
+        Its order is that of `ModelSpec.drive`.
+        """
         ...
 
     @property
@@ -58,6 +61,11 @@ class Plant(Protocol[StateT, LoadedT]):
         ...
 
     @property
+    def inputs(self) -> int:
+        """Length of the input vector."""
+        ...
+
+    @property
     def is_constant(self) -> bool:
         """Whether mass matrix and Jacobians of the struts are the same in every state."""
         ...
@@ -67,26 +75,30 @@ class Plant(Protocol[StateT, LoadedT]):
         heights_m: Sequence[float],
         velocities_m_per_s: Sequence[float] | None = None,
         t_s: float = 0.0,
+        inputs: Sequence[float] | None = None,
     ) -> StateT:
-        """State with given strut heights, at rest unless velocities are given."""
+        """State with given strut heights, at rest unless velocities are given.
+
+        Bodies that are moved are where the inputs have them; without inputs they are at zero.
+        """
         ...
 
     def load(
         self,
         state: StateT,
         virtual_forces_n: Sequence[float],
-        applied_force_n: float,
+        inputs: Sequence[float],
         temperature_c: float,
     ) -> LoadedT:
         """The state with forces on it; virtual forces are constant from it on."""
         ...
 
-    def step(self, loaded: LoadedT, dt_s: float, applied_force_end_n: float) -> StateT:
-        """State after `dt_s`, with an applied force that is linear in between."""
+    def step(self, loaded: LoadedT, dt_s: float, inputs_end: Sequence[float]) -> StateT:
+        """State after `dt_s`; forces of the inputs are linear in between."""
         ...
 
     def slopes(
-        self, state: StateT, applied_force_n: float, temperature_c: float
+        self, state: StateT, inputs: Sequence[float], temperature_c: float
     ) -> Sequence[tuple[float, float]] | None:
         """Stiffness (N/m) and damping (N·s/m) of each strut's law about a state.
 

@@ -3,7 +3,7 @@
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,6 +34,7 @@ MODELS = Path(__file__).parent / "models"
 WORLD = "world"
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.-]{0,63}$")]
+InputName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}$")]
 Vector = tuple[Finite, Finite, Finite]
 
 _PERCENTAGE = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,40})?) ?%")
@@ -64,6 +65,16 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def _with_a_direction(axis: Vector) -> Vector:
+    if sum(x * x for x in axis) < 1e-12:
+        raise ValueError(f"{list(axis)}: expected a direction that is not zero")
+    return axis
+
+
+Axis = Annotated[Vector, AfterValidator(_with_a_direction)]
+"""A direction, of any length."""
+
+
 class JointSpec(_Frozen):
     """Joint between a body and its parent.
 
@@ -75,15 +86,9 @@ class JointSpec(_Frozen):
     """
 
     type: Literal["prismatic", "revolute", "ball", "free"]
-    axis: Vector = (0.0, 0.0, 1.0)
+    axis: Axis = (0.0, 0.0, 1.0)
     parent: Name = WORLD
     offset_m: Vector = (0.0, 0.0, 0.0)
-
-    @model_validator(mode="after")
-    def _axis_has_a_direction(self) -> "JointSpec":
-        if sum(x * x for x in self.axis) < 1e-12:
-            raise ValueError(f"axis {list(self.axis)}: expected a direction that is not zero")
-        return self
 
 
 class BodySpec(_Frozen):
@@ -253,6 +258,72 @@ class StrutSpec(_Frozen):
         return self
 
 
+class ForceInput(_Frozen):
+    """A force on a body, in N.
+
+    Attributes:
+        force_on: Body on which the force acts.
+        at: Point of the body at which it acts, in the body's frame.
+        axis: Direction of what is positive: of a force in the world's frame, of a motion along its
+            joint in the frame of the joint's parent.
+    """
+
+    force_on: Name
+    at: Vector = (0.0, 0.0, 0.0)
+    axis: Axis = (0.0, 0.0, 1.0)
+
+
+class TorqueInput(_Frozen):
+    """A torque on a revolute joint, in N·m.
+
+    Attributes:
+        torque_on: Joint on which the torque acts, positive about the joint's axis. The joint of a
+            body of `bodies` is called as the body with `_joint` behind it.
+    """
+
+    torque_on: Name
+
+
+class MotionInput(_Frozen):
+    """A measured motion of a body, in m: the body moves as measured, whatever force it takes.
+
+    Attributes:
+        motion_of: Body that moves; its joint is prismatic and has no other coordinate.
+        axis: Direction of what is positive: of a force in the world's frame, of a motion along its
+            joint in the frame of the joint's parent.
+    """
+
+    motion_of: Name
+    axis: Axis = (0.0, 0.0, 1.0)
+
+
+_INPUT_KINDS = {"force_on": ForceInput, "torque_on": TorqueInput, "motion_of": MotionInput}
+
+
+def _input_kind(given: object) -> str | None:
+    """Tag of the kind, so that an error is about this one alone."""
+    for key, kind in _INPUT_KINDS.items():
+        if isinstance(given, kind) or (isinstance(given, dict) and key in given):
+            return f"<{key}>"
+    return None
+
+
+InputSpec = Annotated[
+    Annotated[ForceInput, Tag("<force_on>")]
+    | Annotated[TorqueInput, Tag("<torque_on>")]
+    | Annotated[MotionInput, Tag("<motion_of>")],
+    Discriminator(
+        _input_kind,
+        custom_error_type="input_kind",
+        custom_error_message="expected one of force_on, torque_on and motion_of",
+    ),
+]
+"""What drives the bench."""
+
+APPLIED_FORCE = "applied_force"
+"""Name of the input of a model that states none."""
+
+
 class ModelTolerance(_Frozen):
     """Prior standard deviation of the bench's parameters from the model's values.
 
@@ -286,8 +357,10 @@ class ModelSpec(_Frozen):
         name: Name of the model.
         gravity_m_per_s2: Gravitational acceleration, in the direction of -z.
         skeleton: Bodies and joints: either `bodies` or `file`.
+        inputs: What drives the bench, by name: forces, torques and measured motions. If absent,
+            there is one force in the direction of +z, called `applied_force`.
         struts: Spring-dampers; each may have an observer.
-        applied_force_body: Body at whose origin the applied force acts, in the direction of +z; by
+        applied_force_body: Without `inputs`: body at whose origin the applied force acts; by
             default the upper body of the last strut, or its lower body if the upper one is
             `world`.
         tolerance: Prior standard deviation of the bench's parameters from the values in this file.
@@ -300,6 +373,7 @@ class ModelSpec(_Frozen):
         Annotated[InlineSkeleton, Tag("<bodies>")] | Annotated[FileSkeleton, Tag("<file>")],
         Discriminator(_skeleton_kind),
     ]
+    inputs: Annotated[dict[InputName, InputSpec], Field(min_length=1, max_length=64)] | None = None
     struts: Annotated[tuple[StrutSpec, ...], Field(min_length=1, max_length=64)]
     applied_force_body: Name | None = None
     tolerance: ModelTolerance | None = None
@@ -308,6 +382,11 @@ class ModelSpec(_Frozen):
     @model_validator(mode="after")
     def _names_fit(self) -> "ModelSpec":
         _refuse_duplicates("strut", (strut.name for strut in self.struts))
+        if self.inputs is not None and self.applied_force_body is not None:
+            raise ValueError(
+                "applied_force_body: expected none together with inputs, of which each names its "
+                "body or joint"
+            )
         if isinstance(self.skeleton, InlineSkeleton):
             self._check_bodies(self.skeleton)
         return self
@@ -330,11 +409,31 @@ class ModelSpec(_Frozen):
                     raise ValueError(
                         f"strut {strut.name}: between {end!r}: {expected_name(end, known)}"
                     )
+        bodies = known[1:]
         body_name = self.applied_force_body
-        if body_name is not None and body_name not in known[1:]:
+        if body_name is not None and body_name not in bodies:
             raise ValueError(
-                f"applied_force_body {body_name!r}: {expected_name(body_name, known[1:])}"
+                f"applied_force_body {body_name!r}: {expected_name(body_name, bodies)}"
             )
+        for name, item in (self.inputs or {}).items():
+            ((key, acts_on),) = item.model_dump(include=set(_INPUT_KINDS)).items()
+            choices = [f"{body}_joint" for body in bodies] if key == "torque_on" else bodies
+            if acts_on not in choices:
+                raise ValueError(
+                    f"inputs.{name}: {key} {acts_on!r}: {expected_name(acts_on, choices)}"
+                )
+
+    @property
+    def drive(self) -> Mapping[str, ForceInput | TorqueInput | MotionInput]:
+        """What drives the bench, by name: its inputs, or the one applied force of a model without.
+
+        The order is that of the input vector of a plant.
+        """
+        if self.inputs is not None:
+            return self.inputs
+        lower, upper = self.struts[-1].between
+        body = self.applied_force_body or (upper if upper != WORLD else lower)
+        return {APPLIED_FORCE: ForceInput(force_on=body)}
 
     def strut(self, name: str) -> StrutSpec:
         """The strut called `name`.

@@ -1,6 +1,8 @@
 """DART as a black box: state in, forces in, state out.
 
     skeleton      bodies and joints in DART
+    inputs        what drives the model: forces, torques, moved bodies
+    motion_between  the motion of a moved body between two times
     geometry      heights and Jacobians of the struts
     strut         spring, damper and effects as one force
     fmu           a force that a functional mock-up unit computes
@@ -17,6 +19,7 @@ Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
 
 from dart_model.effects import AMBIENT_C
@@ -68,7 +71,9 @@ class DartPlant:
         self._geometry = Geometry(spec, self._skeleton)
         self._struts = struts_of(spec)
         self._equations: EquationsOfMotion[float] | EquationsOfMotion[Array]
-        if self.coordinates == 1 and self._geometry.constant is not None:
+        self.inputs = self._skeleton.inputs.size
+        """Length of the input vector, as `dart_model.plant.inputs` defines it."""
+        if self.coordinates == self.inputs == 1 and self._geometry.constant is not None:
             one = OneCoordinate(self._skeleton)
             self._equations = EquationsOfMotion[float](one, self._struts, self._geometry)
         else:
@@ -91,6 +96,22 @@ class DartPlant:
         return self._skeleton.coordinates
 
     @property
+    def free(self) -> NDArray[np.intp]:
+        """Indices of the coordinates that are free to move: of all that are not given."""
+        return self._skeleton.inputs.free
+
+    @property
+    def free_coordinates(self) -> int:
+        """Number of coordinates that are free to move."""
+        return len(self._skeleton.inputs.free)
+
+    @property
+    def motion_columns(self) -> NDArray[np.intp]:
+        """Index of each motion's position in the input vector, shape (motions,)."""
+        moved = self._skeleton.inputs.moved
+        return np.zeros(0, dtype=np.intp) if moved is None else moved.positions
+
+    @property
     def internal_states(self) -> int:
         """Number of internal states of all effects."""
         return sum(strut.states for strut in self._struts)
@@ -105,6 +126,7 @@ class DartPlant:
         heights_m: Sequence[float],
         velocities_m_per_s: Sequence[float] | None = None,
         t_s: float = 0.0,
+        inputs: Sequence[float] | None = None,
     ) -> PlantState:
         """State with given strut heights and velocities; internal states are zero.
 
@@ -114,52 +136,63 @@ class DartPlant:
             heights_m: One height a strut; NaN where none is given.
             velocities_m_per_s: One velocity a strut; at rest if absent.
             t_s: Time.
+            inputs: Input vector, for the bodies that are moved; zero if absent.
 
         Raises:
             ModelError: The joints cannot reach the heights.
         """
-        q = self._geometry.reaching(np.asarray(heights_m, np.float64), np.zeros(self.coordinates))
-        v = np.zeros(self.coordinates)
+        q, v = np.zeros(self.coordinates), np.zeros(self.coordinates)
+        if inputs is not None:
+            self.put_moved(q, v, np.asarray(inputs, np.float64))
+        q = self._geometry.reaching(np.asarray(heights_m, np.float64), q)
         given = np.isfinite(heights_m)
         if not given.all():
             q = self._resting(q, np.asarray(heights_m, np.float64))
         if velocities_m_per_s is not None:
-            struts = self._geometry.at(q).struts[given]
-            v = np.linalg.lstsq(struts, np.asarray(velocities_m_per_s)[given], rcond=None)[0]
+            struts, free = self._geometry.at(q).struts[given], self._skeleton.inputs.free
+            own = np.asarray(velocities_m_per_s)[given] - struts @ v
+            v[free] = np.linalg.lstsq(struts[:, free], own, rcond=None)[0]
         return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
+
+    def put_moved(self, q: Array, v: Array, inputs: Array) -> None:
+        """Write positions and velocities of moved bodies into coordinates and rates, each (n,)."""
+        if self._skeleton.inputs.moved is not None:
+            self._skeleton.inputs.moved.put(q, v, inputs)
 
     def _resting(self, q: Array, heights_m: Array) -> Array:
         """Coordinates with the given heights, at rest in the directions that these leave free.
 
         Where there is no such rest within a metre, these directions stay as they are.
         """
-        start = q
+        start, own = q, np.eye(self.coordinates)[:, self._skeleton.inputs.free]
         for _ in range(_RESTING_STEPS):
             given = self._geometry.at(q).struts[np.isfinite(heights_m)]
-            free: Array = null_space(given)
+            free: Array = null_space(given @ own)
             if not free.size:
                 return q
             force = free.T @ self._force_at_rest(q)
+            free_in_all: Array = own @ free
             slopes = [
                 self._force_at_rest(q + _RESTING_STEP * direction)
                 - self._force_at_rest(q - _RESTING_STEP * direction)
-                for direction in free.T
+                for direction in free_in_all.T
             ]
             stiffness = -free.T @ np.column_stack(slopes) / (2.0 * _RESTING_STEP)
             # No spring holds some directions: they stay where they are.
             move = np.linalg.lstsq(stiffness, force, rcond=_SPRINGLESS)[0]
             move *= min(1.0, _LONGEST_MOVE / max(float(np.abs(move).max()), 1e-300))
-            q = self._geometry.reaching(heights_m, q + free @ move)
+            q = self._geometry.reaching(heights_m, q + free_in_all @ move)
             if np.abs(move).max() < _RESTED:
                 return q if np.abs(q - start).max() < _FARTHEST else start
         return start
 
     def _force_at_rest(self, q: Array) -> Array:
-        """Generalised force of weight and struts at coordinates `q` at rest, shape (n,)."""
+        """Generalised force of weight and struts on what is free, at rest at coordinates `q`."""
         zeros = np.zeros(self.coordinates)
         here = self.mechanics(q, zeros)
         state = self.state(q.tolist(), zeros.tolist(), (0.0,) * self.internal_states, 0.0)
-        forces_n = self.load(state, (0.0,) * self.struts, 0.0, AMBIENT_C).forces_n
+        no_inputs = (0.0,) * self.inputs
+        forces_n = self.load(state, (0.0,) * self.struts, no_inputs, AMBIENT_C).forces_n
         return here.bias + here.struts.T @ np.array(forces_n)
 
     def state(
@@ -173,36 +206,42 @@ class DartPlant:
         return self._equations.state(positions, velocities, internal, t_s)
 
     def numbers(self, state: PlantState) -> tuple[float, ...]:
-        """A state as numbers without its time, to differentiate a step."""
-        return (*state.positions, *state.velocities, *state.internal)
+        """A state as numbers, to differentiate a step: without its time, and what is moved."""
+        free: list[int] = self.free.tolist()
+        positions = [state.positions[k] for k in free]
+        velocities = [state.velocities[k] for k in free]
+        return (*positions, *velocities, *state.internal)
 
     def state_of(self, numbers: Sequence[float], t_s: float = 0.0) -> PlantState:
-        """The state of numbers as `numbers` returns them."""
-        n = self.coordinates
-        return self.state(numbers[:n], numbers[n : 2 * n], tuple(numbers[2 * n :]), t_s)
+        """The state of numbers as `numbers` returns them; what is moved is at zero."""
+        n = self.free_coordinates
+        q, v = np.zeros((2, self.coordinates))
+        q[self.free], v[self.free] = numbers[:n], numbers[n : 2 * n]
+        return self.state(q.tolist(), v.tolist(), tuple(numbers[2 * n :]), t_s)
 
     def load(
         self,
         state: PlantState,
         virtual_forces_n: Sequence[float],
-        applied_force_n: float,
+        inputs: Sequence[float],
         temperature_c: float,
     ) -> Loaded:
-        """Let forces act on a state."""
-        return self._equations.load(state, virtual_forces_n, applied_force_n, temperature_c)
+        """Let forces act on a state, whose moved bodies are where the inputs have them."""
+        return self._equations.load(state, virtual_forces_n, inputs, temperature_c)
 
-    def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
+    def step(self, loaded: Loaded, dt_s: float, inputs_end: Sequence[float]) -> PlantState:
         """Advance the model.
 
         Args:
             loaded: State at the beginning and the forces on it; virtual forces are held.
             dt_s: Duration; divided into steps of at most `step_s`, and into 10 000 at most.
-            applied_force_end_n: Applied force at the end; it is linear in between.
+            inputs_end: Inputs at the end. In between, forces are linear, and motions are the
+                smooth polynomials through those at both ends.
         """
-        return self._equations.step(loaded, dt_s, applied_force_end_n, self.step_s)
+        return self._equations.step(loaded, dt_s, inputs_end, self.step_s)
 
     def slopes(
-        self, state: PlantState, applied_force_n: float, temperature_c: float
+        self, state: PlantState, inputs: Sequence[float], temperature_c: float
     ) -> Sequence[tuple[float, float]] | None:
         """Stiffness (N/m) and damping (N·s/m) of each strut's law about a state.
 
@@ -212,7 +251,7 @@ class DartPlant:
         if not self._slopes_vary:
             return None
         try:
-            return self._equations.slopes(state, applied_force_n, temperature_c)
+            return self._equations.slopes(state, inputs, temperature_c)
         except (ArithmeticError, ValueError):
             return None
 
@@ -222,18 +261,39 @@ class DartPlant:
 
     def mechanics(self, q: Array, v: Array) -> Mechanics:
         """Equations of motion at coordinates `q` with rates `v`, each of shape (n,)."""
-        here, dart = self._geometry.at(q), self._skeleton.dart
+        here, dart, inputs = self._geometry.at(q), self._skeleton.dart, self._skeleton.inputs
         dart.setPositions(q)
         dart.setVelocities(v)
         dart.setForces(np.zeros(self.coordinates))
+        dart.setCommands(np.zeros(self.coordinates))
         dart.computeForwardDynamics()
-        mass = np.array(dart.getMassMatrix(), dtype=np.float64)
-        bias = mass @ np.array(dart.getAccelerations(), dtype=np.float64)
-        return Mechanics(here.heights_m(q), here.struts, here.applied, mass, bias)
+        every = np.array(dart.getMassMatrix(), dtype=np.float64)
+        free, moved = inputs.free, inputs.moved
+        mass = every[np.ix_(free, free)]
+        bias = mass @ np.array(dart.getAccelerations(), dtype=np.float64)[free]
+        columns, by_motion = here.inputs[free], np.zeros((self.struts, 0))
+        if moved is not None:
+            columns = columns - every[free][:, moved.coordinates] @ here.inputs[moved.coordinates]
+            by_motion = here.struts[:, moved.coordinates] * moved.signs
+        struts = np.ascontiguousarray(here.struts[:, free])
+        return Mechanics(here.heights_m(q), struts, columns, by_motion, mass, bias)
 
     def bias_slopes(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Derivatives (n, n) of the bias force by coordinates (n,) and by their rates (n,)."""
-        steps = _DIFFERENCE * np.eye(len(q))
+        """Derivatives of the bias force by coordinates (n,) and by their rates (n,).
+
+        The force is that on what is free, and so are the coordinates; shape (n, n).
+        """
+        return self._bias_slopes(q, v, np.eye(len(q))[self.free])
+
+    def bias_slopes_by_motion(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """The same by positions and by velocities of moved bodies, shape (n, motions)."""
+        moved = self._skeleton.inputs.moved
+        if moved is None:
+            return np.zeros((self.free_coordinates, 0)), np.zeros((self.free_coordinates, 0))
+        return self._bias_slopes(q, v, moved.signs[:, None] * np.eye(len(q))[moved.coordinates])
+
+    def _bias_slopes(self, q: Array, v: Array, directions: Array) -> tuple[Array, Array]:
+        steps = _DIFFERENCE * directions
         by_q = [self.mechanics(q + h, v).bias - self.mechanics(q - h, v).bias for h in steps]
         by_v = [self.mechanics(q, v + h).bias - self.mechanics(q, v - h).bias for h in steps]
         scale = 2.0 * _DIFFERENCE
@@ -245,9 +305,13 @@ class DartPlant:
         if self._geometry.constant is None:
             return False
         first, *others = [
-            self.mechanics(q, np.zeros_like(q)).mass for q in sample_positions(self.coordinates)
+            self.mechanics(q, np.zeros_like(q)) for q in sample_positions(self.coordinates)
         ]
-        return all(np.allclose(first, other, rtol=1e-9, atol=0.0) for other in others)
+        return all(
+            np.allclose(first.mass, other.mass, rtol=1e-9, atol=0.0)
+            and np.allclose(first.inputs, other.inputs, rtol=1e-9, atol=1e-12)
+            for other in others
+        )
 
     def _longest_step_s(self) -> float:
         linear = [(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in self.spec.struts]

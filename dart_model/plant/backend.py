@@ -41,7 +41,30 @@ class Backend(Protocol[Value]):
         ...
 
     def acceleration(self, q: Value, v: Value, force: Value) -> Value:
-        """Second derivative of the coordinates under generalised forces, in m/s² or rad/s²."""
+        """Second derivative of the coordinates under generalised forces, in m/s² or rad/s².
+
+        Of a moved coordinate, `force` has the acceleration.
+        """
+        ...
+
+    def drive(self, columns: Value, inputs: Value, /) -> Value:
+        """Generalised force of inputs, by their columns as of `Jacobians.inputs`."""
+        ...
+
+    def columns(self, columns: Array) -> Value:
+        """Columns as `drive` reads them, from an array of shape (n, inputs)."""
+        ...
+
+    def between(self, begin: Value, end: Value, duration_s: float) -> Callable[[float], Value]:
+        """Inputs at a share of a step, from those at its ends."""
+        ...
+
+    def put_moved(self, q: Value, v: Value, inputs: Value) -> None:
+        """Write what is moved into coordinates and rates."""
+        ...
+
+    def applied_force_n(self, inputs: Value) -> float:
+        """Applied force of the laws that depend on one: the first force of the inputs."""
         ...
 
 
@@ -50,9 +73,10 @@ _SAMPLE_FORCES_N = (0.0, 1e-3, -0.7, 37.3, -4100.0)
 
 
 class OneCoordinate:
-    """The only coordinate of a skeleton, as a float."""
+    """The only coordinate of a skeleton and its only input, as floats."""
 
     dot = staticmethod(operator.mul)
+    drive = staticmethod(operator.mul)
     value = staticmethod(operator.itemgetter(0))
 
     def __init__(self, skeleton: Skeleton) -> None:
@@ -71,6 +95,20 @@ class OneCoordinate:
 
     def move(self, q: float, v: float, h: float) -> float:
         return q + h * v
+
+    def columns(self, columns: Array) -> float:
+        return float(columns[0, 0])
+
+    def between(self, begin: float, end: float, duration_s: float) -> Callable[[float], float]:
+        del duration_s
+        rise = end - begin
+        return lambda share: begin + share * rise
+
+    def put_moved(self, q: float, v: float, inputs: float) -> None:
+        """Nothing: its only coordinate is free."""
+
+    def applied_force_n(self, inputs: float) -> float:
+        return inputs
 
     def _accelerate_from(self, q: float, v: float, force: float) -> float:
         self._put_position(q)
@@ -108,9 +146,13 @@ class ManyCoordinates:
         self._skeleton = skeleton
         # DART's functions for arrays cost as much as six or more of those for one number.
         coordinates = [skeleton.dart.getDof(k) for k in range(skeleton.coordinates)]
+        free = skeleton.inputs.free.tolist()
         self._put: list[tuple[Callable[[float], None], ...]] = [
-            (item.setPosition, item.setVelocity, item.setForce) for item in coordinates
+            (item.setPosition, item.setVelocity, item.setForce if k in free else item.setCommand)
+            for k, item in enumerate(coordinates)
         ]
+        self._moved = skeleton.inputs.moved
+        self._first_force = skeleton.inputs.first_force
         self._get: list[Callable[[], float]] = [item.getAcceleration for item in coordinates]
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
         self._adds_up = coordinates_add_up(skeleton)
@@ -123,6 +165,25 @@ class ManyCoordinates:
 
     def dot(self, row: Array, value: Array) -> float:
         return float(row @ value)
+
+    def drive(self, columns: Array, inputs: Array) -> Array:
+        return columns @ inputs
+
+    def columns(self, columns: Array) -> Array:
+        return columns
+
+    def between(self, begin: Array, end: Array, duration_s: float) -> Callable[[float], Array]:
+        if self._moved is not None:
+            return self._moved.between(begin, end, duration_s)
+        rise = end - begin
+        return lambda share: begin + share * rise
+
+    def put_moved(self, q: Array, v: Array, inputs: Array) -> None:
+        if self._moved is not None:
+            self._moved.put(q, v, inputs)
+
+    def applied_force_n(self, inputs: Array) -> float:
+        return 0.0 if self._first_force is None else float(inputs[self._first_force])
 
     def move(self, q: Array, v: Array, h: float) -> Array:
         return q + h * v if self._adds_up else move(self._skeleton, q, v, h)

@@ -16,9 +16,10 @@ _MOST_STEPS = 10_000
 """Steps of one call; one that is so late that it would need more takes longer ones."""
 
 
-_Configuration = tuple[tuple[tuple[Strut, float, Value], ...], Value]
+_Configuration = tuple[tuple[tuple[Strut, float, Value, Value], ...], Value]
 """Struts in one configuration, ``height = offset + row @ q`` (strut, offset in m, row of the
-Jacobian), and the generalised force per newton of applied force."""
+Jacobian, generalised force per newton), and the columns of the inputs. The last two differ where a
+body is moved: no force changes its motion."""
 
 
 class EquationsOfMotion(Generic[Value]):
@@ -31,6 +32,7 @@ class EquationsOfMotion(Generic[Value]):
         self._struts = tuple(struts)
         self._no_rates = [0.0] * sum(strut.states for strut in struts)
         self._geometry = geometry
+        self._is_free = geometry.is_free
         constant = geometry.constant
         self._constant = None if constant is None else self._configuration(constant)
         # The next force is computed where a tick ends: its configuration is computed once.
@@ -51,26 +53,27 @@ class EquationsOfMotion(Generic[Value]):
         self,
         state: PlantState,
         virtual_forces_n: Sequence[float],
-        applied_force_n: float,
+        inputs: Sequence[float],
         temperature_c: float,
     ) -> Loaded:
         """Let forces act on a state."""
         backend, internal, t_s = self._backend, state.internal, state.t_s
         q, v = backend.value(state.positions), backend.value(state.velocities)
-        struts, applied = self._constant or self._at(q)
+        struts, columns = self._constant or self._at(q)
         rates = self._no_rates.copy()
-        total = applied_force_n * applied
+        drive = backend.value(inputs)
+        total, applied_force_n = backend.drive(columns, drive), backend.applied_force_n(drive)
         forces: list[float] = []
-        for index, (strut, _, row) in enumerate(struts):
+        for index, (strut, _, _, push) in enumerate(struts):
             height_m, velocity_m_per_s = state.struts[index]
             force = strut.force_n(
                 height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
             )
             forces.append(force)
-            total = total + (force + virtual_forces_n[index]) * row
+            total = total + (force + virtual_forces_n[index]) * push
         acceleration = backend.acceleration(q, v, total)
         accelerations: list[float] = []
-        for _, _, row in struts:
+        for _, _, row, _ in struts:
             accelerations.append(backend.dot(row, acceleration))
         if self._constant is None:
             q_now, v_now = np.array(state.positions), np.array(state.velocities)
@@ -79,7 +82,7 @@ class EquationsOfMotion(Generic[Value]):
         return Loaded(
             state,
             tuple(virtual_forces_n),
-            applied_force_n,
+            tuple(inputs),
             temperature_c,
             forces,
             accelerations,
@@ -90,9 +93,10 @@ class EquationsOfMotion(Generic[Value]):
         )
 
     def slopes(
-        self, state: PlantState, applied_force_n: float, temperature_c: float
+        self, state: PlantState, inputs: Sequence[float], temperature_c: float
     ) -> Sequence[tuple[float, float]]:
         """Slopes of each strut's law; arguments and result as of `DartPlant.slopes`."""
+        applied_force_n = self._backend.applied_force_n(self._backend.value(inputs))
         rest = state.internal, state.t_s, applied_force_n, temperature_c
         return [
             strut.slopes(*motion, *rest)
@@ -100,27 +104,30 @@ class EquationsOfMotion(Generic[Value]):
         ]
 
     def step(
-        self, loaded: Loaded, dt_s: float, applied_force_end_n: float, longest_s: float
+        self, loaded: Loaded, dt_s: float, inputs_end: Sequence[float], longest_s: float
     ) -> PlantState:
         """Advance in steps of at most `longest_s`; other arguments as of `DartPlant.step`."""
         backend, state, constant = self._backend, loaded.state, self._constant
         virtual_forces_n, temperature_c = loaded.virtual_forces_n, loaded.temperature_c
         dot, acceleration, no_rates = backend.dot, backend.acceleration, self._no_rates
+        drive, put_moved, applied = backend.drive, backend.put_moved, backend.applied_force_n
 
         def slope(
-            q: Value, v: Value, internal: Internal, t_s: float, applied_force_n: float
+            q: Value, v: Value, internal: Internal, t_s: float, inputs: Value
         ) -> tuple[Value, Sequence[float]]:
-            struts, applied = constant or self._at(q)
+            put_moved(q, v, inputs)
+            struts, columns = constant or self._at(q)
             rates = no_rates.copy()
-            total = applied_force_n * applied
-            for index, (strut, offset_m, row) in enumerate(struts):
+            total, applied_force_n = drive(columns, inputs), applied(inputs)
+            for index, (strut, offset_m, row, push) in enumerate(struts):
                 height_m, velocity_m_per_s = offset_m + dot(row, q), dot(row, v)
                 force = strut.force_n(
                     height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
                 )
-                total = total + (force + virtual_forces_n[index]) * row
+                total = total + (force + virtual_forces_n[index]) * push
             return acceleration(q, v, total), rates
 
+        end = backend.value(inputs_end)
         q, v, internal = advance(
             slope,
             backend.move,
@@ -130,16 +137,17 @@ class EquationsOfMotion(Generic[Value]):
                 state.t_s,
                 dt_s,
                 count_steps(dt_s, longest_s),
-                (loaded.applied_force_n, applied_force_end_n),
+                backend.between(backend.value(loaded.inputs), end, dt_s),
             ),
         )
+        put_moved(q, v, end)
         return self._state(q, v, internal, state.t_s + dt_s)
 
     def _state(self, q: Value, v: Value, internal: Internal, t_s: float) -> PlantState:
         backend, dot = self._backend, self._backend.dot
         struts, _ = self._constant or self._at(q)
         motions: list[tuple[float, float]] = []
-        for _, offset_m, row in struts:
+        for _, offset_m, row, _ in struts:
             motions.append((offset_m + dot(row, q), dot(row, v)))
         return PlantState(backend.numbers(q), backend.numbers(v), internal, t_s, motions)
 
@@ -151,11 +159,12 @@ class EquationsOfMotion(Generic[Value]):
 
     def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
         value = self._backend.value
-        columns = self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist()
+        columns = self._struts, jacobians.offsets_m.tolist(), jacobians.struts
         rows = (
-            (strut, offset_m, value(row)) for strut, offset_m, row in zip(*columns, strict=True)
+            (strut, offset_m, value(row.tolist()), value((row * self._is_free).tolist()))
+            for strut, offset_m, row in zip(*columns, strict=True)
         )
-        return tuple(rows), value(jacobians.applied.tolist())
+        return tuple(rows), self._backend.columns(jacobians.inputs)
 
 
 def count_steps(dt_s: float, longest_s: float) -> int:

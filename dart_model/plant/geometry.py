@@ -23,17 +23,18 @@ _SHORTEST_M = 1e-12
 
 
 class Jacobians(NamedTuple):
-    """Struts and applied force in one configuration `q`, of n coordinates.
+    """Struts and inputs in one configuration `q`, of n coordinates.
 
     Attributes:
         offsets_m: Heights less ``struts @ q``, shape (struts,).
         struts: Derivative of the heights by the coordinates, shape (struts, n).
-        applied: Generalised force per newton of applied force, shape (n,).
+        inputs: Generalised force per unit of each input, shape (n, inputs); in the row of a moved
+            coordinate its acceleration.
     """
 
     offsets_m: Array
     struts: Array
-    applied: Array
+    inputs: Array
 
     def heights_m(self, q: Array) -> Array:
         """Strut heights, shape (struts,); exact at the configuration itself."""
@@ -106,6 +107,9 @@ class Geometry:
         )
         """Directions of guided struts, shape (struts, 3); NaN where the height is a distance."""
         self._is_distance = np.isnan(self._guides[:, 0])
+        self.is_free = np.zeros(skeleton.coordinates)
+        """1 for a coordinate that is free to move, 0 for one that is moved, shape (n,)."""
+        self.is_free[skeleton.inputs.free] = 1.0
         self.constant = self._same_everywhere()
         """The Jacobians, if they are the same in every configuration."""
 
@@ -118,8 +122,7 @@ class Geometry:
         lower, upper = (wrenches[:, :, None] @ ends.jacobians)[:, :, 0]
         struts = upper - lower
         heights = np.sum(directions * ends.gaps_m, axis=1)
-        loaded = self._skeleton.dart.getLinearJacobian(self._skeleton.loaded)
-        return Jacobians(heights - struts @ q, struts, np.array(loaded[2], dtype=np.float64))
+        return Jacobians(heights - struts @ q, struts, self._skeleton.inputs.columns())
 
     def centripetal(self, q: Array, v: Array) -> Array:
         """Second derivative of the heights at `q` with constant rates `v`, shape (struts,).
@@ -169,7 +172,7 @@ class Geometry:
         return _Ends(arms, jacobians, upper - lower)
 
     def reaching(self, heights_m: Array, near: Array) -> Array:
-        """Coordinates with given strut heights, by Newton's method.
+        """Coordinates with given strut heights, by Newton's method; moved ones stay where they are.
 
         Heights of more struts than coordinates are those of sensors that disagree by their noise:
         the coordinates are the nearest, in the least squares.
@@ -182,16 +185,18 @@ class Geometry:
             ModelError: The joints cannot reach the heights.
         """
         q, given = near, np.isfinite(heights_m)
+        free = self._skeleton.inputs.free
         for _ in range(_NEWTON_STEPS):
             here = self.at(q)
             error = (heights_m - here.heights_m(q))[given]
             if float(np.max(np.abs(error), initial=0.0)) < _REACHED_M:
                 break
-            step = np.linalg.lstsq(here.struts[given], error, rcond=None)[0]
-            q = q + step
+            step = np.linalg.lstsq(here.struts[given][:, free], error, rcond=None)[0]
+            q = q.copy()
+            q[free] += step
             if float(np.max(np.abs(step))) < _REACHED_M:
                 break
-        allowed_m = _OUT_OF_REACH_M if np.sum(given) <= len(q) else _DISAGREEMENT_M
+        allowed_m = _OUT_OF_REACH_M if np.sum(given) <= len(free) else _DISAGREEMENT_M
         reached = self.at(q).heights_m(q)[given]
         if not np.allclose(reached, heights_m[given], rtol=0.0, atol=allowed_m):
             raise ModelError(

@@ -9,7 +9,7 @@ Hairer, Nørsett, Wanner, "Solving Ordinary Differential Equations I" (1993), se
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -21,9 +21,10 @@ Value = TypeVar("Value", float, Array)
 Internal = tuple[float, ...]
 """Internal states."""
 
-Slope = Callable[[Value, Value, Internal, float, float], tuple[Value, Sequence[float]]]
-"""Coordinates, their rates, internal states, time (s), input -> second derivative of the
-coordinates, derivative of the internal states."""
+Slope = Callable[[Value, Value, Internal, float, Value], tuple[Value, Sequence[float]]]
+"""Coordinates, their rates, internal states, time (s), inputs -> second derivative of the
+coordinates, derivative of the internal states. Moved coordinates and rates are written to where
+the inputs have them."""
 
 Move = Callable[[Value, Value, float], Value]
 """Coordinates, rates, duration (s) -> coordinates after it."""
@@ -47,12 +48,12 @@ enough that the method is stable, as it is up to 2.5."""
 
 
 class Course(Struct, frozen=True, gc=False):
-    """Steps of equal length, with an input that is linear from the beginning to the end."""
+    """Steps of equal length, and the inputs at a share of all of them."""
 
     t_s: float
     duration_s: float
     steps: int
-    inputs: tuple[float, float]
+    inputs: Callable[[float], Any]
 
 
 def advance(
@@ -64,21 +65,19 @@ def advance(
 ) -> tuple[Value, Value, Internal]:
     """Coordinates, rates and internal states after equal steps from a start with slope `first`."""
     (q, v, internal), (a1, rates1) = start, first
-    t_s, steps = course.t_s, course.steps
-    given, end = course.inputs
+    t_s, steps, inputs = course.t_s, course.steps, course.inputs
     h = course.duration_s / steps
     half, sixth = 0.5 * h, h / 6.0
-    rise = (end - given) / steps
-    while True:
+    for step in range(1, steps + 1):
         a2, rates2 = slope(
             move(q, v, half),
             v + half * a1,
             propagate(internal, half, rates1) if internal else internal,
             t_s + half,
-            given + 0.5 * rise,
+            inputs((step - 0.5) / steps),
         )
         t_s += h
-        given += rise
+        given = inputs(step / steps)
         a3, rates3 = slope(
             move(q, v + h * a1, h),
             v + h * (2.0 * a2 - a1),
@@ -95,10 +94,9 @@ def advance(
                 for begin, middle, after in zip(rates1, rates2, rates3, strict=True)
             ]
             internal = propagate(internal, h, mean)
-        steps -= 1
-        if steps == 0:
-            return q, v, internal
-        a1, rates1 = slope(q, v, internal, t_s, given)
+        if step < steps:
+            a1, rates1 = slope(q, v, internal, t_s, given)
+    return q, v, internal
 
 
 def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:

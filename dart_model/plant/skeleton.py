@@ -14,11 +14,12 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.errors import ModelError
 from dart_model.plant.dart_types import DartBody, DartSkeleton
+from dart_model.plant.inputs import Inputs
 from dart_model.skeleton_checks import refuse_fatal
 from dart_model.skeleton_file import MJCF_SUFFIXES, refuse_endless
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
-# dartpy ships no types: it is untyped in this module, and nowhere else.
+# dartpy ships no types.
 _dart = cast("Any", dartpy)
 
 _INSTANT_S = 1e-9
@@ -26,11 +27,11 @@ _INSTANT_S = 1e-9
 
 
 class Skeleton(NamedTuple):
-    """Bodies and joints in DART; the applied force acts on `loaded`."""
+    """Bodies and joints in DART, and what drives them."""
 
     dart: DartSkeleton
     bodies: dict[str, DartBody]
-    loaded: DartBody
+    inputs: Inputs
 
     @property
     def coordinates(self) -> int:
@@ -63,7 +64,7 @@ def build(spec: ModelSpec) -> Skeleton:
     dart.setTimeStep(_INSTANT_S)
     _add_masses(spec, bodies)
     _refuse_singular_mass(spec, dart)
-    return Skeleton(dart, bodies, bodies[_loaded_body_name(spec, bodies)])
+    return Skeleton(dart, bodies, Inputs(spec, dart))
 
 
 def _add_masses(spec: ModelSpec, bodies: dict[str, DartBody]) -> None:
@@ -91,17 +92,6 @@ def _refuse_singular_mass(spec: ModelSpec, dart: DartSkeleton) -> None:
             f"model {spec.name}: skeleton: a joint moves no mass, expected axes that are not zero "
             "and bodies with mass and moments of inertia"
         ) from None
-
-
-def _loaded_body_name(spec: ModelSpec, bodies: dict[str, DartBody]) -> str:
-    name = spec.applied_force_body or spec.struts[-1].between[1]
-    if name == WORLD:
-        name = spec.struts[-1].between[0]
-    if name not in bodies:
-        raise ModelError(
-            f"model {spec.name}: applied_force_body {name!r}: expected one of {', '.join(bodies)}"
-        )
-    return name
 
 
 def _inline_skeleton(name: str, spec: InlineSkeleton) -> DartSkeleton:

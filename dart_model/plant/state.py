@@ -33,6 +33,7 @@ class Loaded(Struct, frozen=True, gc=False):
 
     Attributes:
         virtual_forces_n: Virtual force in each strut, held until the next state.
+        inputs: Input vector, as `dart_model.plant.inputs` defines it.
         forces_n: Spring-damper force of each strut with its effects, without the virtual force.
         accelerations_m_per_s2: Second derivative of each strut's height under all forces.
         position: Coordinates, for the integrator: a float where there is one, else an array.
@@ -42,7 +43,7 @@ class Loaded(Struct, frozen=True, gc=False):
 
     state: PlantState
     virtual_forces_n: tuple[float, ...]
-    applied_force_n: float
+    inputs: tuple[float, ...]
     temperature_c: float
     forces_n: list[float]
     accelerations_m_per_s2: list[float]
@@ -55,12 +56,16 @@ class Loaded(Struct, frozen=True, gc=False):
 class Mechanics(NamedTuple):
     """Equations of motion in one configuration, as DART has them.
 
-    ``mass @ acceleration = bias + struts.T @ strut_forces + applied * applied_force``.
+    ``mass @ acceleration = bias + struts.T @ strut_forces + inputs @ input_vector``, of the n
+    coordinates that are free to move.
 
     Attributes:
         heights_m: Strut heights, shape (struts,).
         struts: Jacobian of the struts, shape (struts, n).
-        applied: Generalised force per newton of applied force, shape (n,).
+        inputs: Generalised force per unit of each input, shape (n, inputs). That of a moved body's
+            acceleration is the inertia that it moves; its position and velocity give none by
+            themselves.
+        moved: Derivative of the heights by the moved bodies' positions, shape (struts, motions).
         mass: Mass matrix, shape (n, n).
         bias: Other generalised forces: weight, Coriolis and centrifugal forces, springs and
             dampers of the joints, shape (n,).
@@ -68,6 +73,7 @@ class Mechanics(NamedTuple):
 
     heights_m: Array
     struts: Array
-    applied: Array
+    inputs: Array
+    moved: Array
     mass: Array
     bias: Array

@@ -1,4 +1,4 @@
-"""A model under the applied force that observers make follow its bench."""
+"""A model under its inputs that observers make follow its bench."""
 
 import itertools
 import math
@@ -12,10 +12,11 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
-from rig.bridge.measurement_age import age_limit_ns, is_too_old
+from rig.bridge.measured_inputs import AnyInput, grace_ns
+from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import TEMPERATURE
 from rig.closed_loop.strut_response import strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
@@ -39,7 +40,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
             may be old; empty where none is late.
         disturbed_ns: Of each strut the time of the last disturbance of its estimate: the start, a
             change of settings, or what its observer takes for one.
-        applied: Last applied force; None before the first.
+        inputs: State of each input of the model; None before its first sample.
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
@@ -52,15 +53,15 @@ class FreeModelState(Struct, frozen=True, gc=False):
     model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
     disturbed_ns: tuple[int, ...] = ()
-    applied: Sample | None = None
+    inputs: tuple[object, ...] = ()
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
 
 
 _Received = Sequence[Sample | None]
-"""The newest samples of a step: of each strut's height, then applied force, then temperature; last
-one that is not used here, as of a load cell that is only logged. None where none arrived."""
+"""The newest samples of a step: of each strut's height, then temperature; last one that is not used
+here, as of a load cell that is only logged. None where none arrived."""
 
 
 SettlingTimes = Callable[[Sequence[AnyObserver]], Sequence[int | None]]
@@ -68,10 +69,11 @@ SettlingTimes = Callable[[Sequence[AnyObserver]], Sequence[int | None]]
 
 
 class FreeModelEstimator:
-    """An estimator whose model moves under the applied force.
+    """An estimator whose model moves under its inputs.
 
     Args:
         channels: Channels of the bench; their indices are their positions.
+        inputs: Inputs of the model, in the order of its input vector.
         stale_after_ns: Age up to which a measurement can start the model.
         settling_times: Settling times of the closed loop with some observers.
         settling_s: What replaces them, if not None.
@@ -85,6 +87,7 @@ class FreeModelEstimator:
         plant: AnyPlant,
         observers: Sequence[AnyObserver],
         channels: Sequence[Channel],
+        inputs: Sequence[AnyInput],
         stale_after_ns: int,
         settling_times: SettlingTimes,
         settling_s: float | None = None,
@@ -104,8 +107,8 @@ class FreeModelEstimator:
             else (round(settling_s * 1e9),) * plant.struts
         )
         struts = plant.struts
-        self._applied, self._temperature, unused = struts, struts + 1, struts + 2
-        slots = {APPLIED_FORCE: self._applied, TEMPERATURE: self._temperature}
+        self._temperature, unused = struts, struts + 1
+        slots = {TEMPERATURE: self._temperature}
         self._slots = [
             channel.strut if channel.role is Role.HEIGHT else slots.get(channel.quantity, unused)
             for channel in channels
@@ -129,10 +132,12 @@ class FreeModelEstimator:
         self._untimed = frozenset(
             strut for strut, channel in self._heights.items() if not channel.has_cycle
         )
-        applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
-        self._has_applied = bool(applied)
-        self._applied_grace_ns = grace_of_applied_force_ns(applied, stale_after_ns)
-        self._longest_silence_ns = self._applied_grace_ns + stale_after_ns
+        self._inputs = tuple(inputs)
+        self._input_of = [-1] * len(channels)
+        for index, item in enumerate(inputs):
+            for channel in item.channels:
+                self._input_of[channel.index] = index
+        self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
 
     @property
     def struts(self) -> int:
@@ -142,11 +147,18 @@ class FreeModelEstimator:
         self, observers: Sequence[AnyObserver], stale_after_ns: int, settling_s: float | None
     ) -> "FreeModelEstimator":
         return FreeModelEstimator(
-            self._plant, observers, self._channels, stale_after_ns, self._settling_times, settling_s
+            self._plant,
+            observers,
+            self._channels,
+            self._inputs,
+            stale_after_ns,
+            self._settling_times,
+            settling_s,
         )
 
     def init(self, t_ns: int) -> FreeModelState:
-        return FreeModelState(t_ns, AMBIENT_C, ((),) * self.struts)
+        no_inputs = (None,) * len(self._inputs)
+        return FreeModelState(t_ns, AMBIENT_C, ((),) * self.struts, inputs=no_inputs)
 
     def unsettle(self, state: FreeModelState, t_ns: int) -> FreeModelState:
         return replace(state, disturbed_ns=(t_ns,) * self.struts, is_settled=False)
@@ -158,7 +170,7 @@ class FreeModelEstimator:
             state.temperature_c,
             ((),) * self.struts,
             observers=state.observers,
-            applied=state.applied,
+            inputs=state.inputs,
             bands=tuple(map(restart_band, state.bands)),
         )
 
@@ -176,18 +188,48 @@ class FreeModelEstimator:
         """Advance the model to a time and correct it with what was measured."""
         received = self._sort(step_input.samples)
         if state.model is None:
-            return self._start_if_possible(state, step_input.t_ns, received)
-        new, last = received[self._applied], state.applied
-        if (
-            new is not None
-            and last is not None
-            and new.t_ns - last.t_ns > self._longest_silence_ns
-            and self._has_heights_since(last.t_ns + self._longest_silence_ns, state)
-        ):
-            # The observers took what was missing of the force for one of the strut.
+            return self._start_if_possible(state, step_input, received)
+        inputs = self._update_inputs(state.inputs, step_input.samples)
+        if self._was_silent(state, inputs):
+            # The observers took what was missing of the input for a force of the strut.
             state = self.restart(state, step_input.t_ns)
-            return self._start_if_possible(state, step_input.t_ns, received)
-        return self._observe(state, state.model, step_input, received)
+            return self._start_if_possible(state, step_input, received)
+        return self._observe(state, state.model, step_input, received, inputs)
+
+    def _update_inputs(
+        self, states: tuple[object, ...], samples: Sequence[Sample]
+    ) -> tuple[object, ...]:
+        """States of the inputs after the samples of a step."""
+        inputs: list[object] | None = None
+        input_of = self._input_of
+        for sample in samples:
+            index = input_of[sample.channel]
+            if index >= 0:
+                inputs = list(states) if inputs is None else inputs
+                inputs[index] = self._inputs[index].update(inputs[index], sample)
+        return states if inputs is None else tuple(inputs)
+
+    def _input_vector(self, states: Sequence[object], t_ns: int) -> tuple[float, ...]:
+        """What drives the model at a time."""
+        vector: tuple[float, ...] = ()
+        for item, state in zip(self._inputs, states, strict=True):
+            vector += item.values(state, t_ns)
+        return vector
+
+    def _was_silent(self, state: FreeModelState, inputs: tuple[object, ...]) -> bool:
+        """Whether an input comes again after heights have come without it."""
+        if inputs is state.inputs:
+            return False
+        for index, (before, now) in enumerate(zip(state.inputs, inputs, strict=True)):
+            if before is None or now is before:
+                continue
+            last_ns, new_ns = map(self._inputs[index].measured_ns, (before, now))
+            silence_ns = self._graces_ns[index] + self._stale_after_ns
+            if new_ns - last_ns > silence_ns and self._has_heights_since(
+                last_ns + silence_ns, state
+            ):
+                return True
+        return False
 
     def _sort(self, samples: Sequence[Sample]) -> list[Sample | None]:
         """The newest samples, by what they are used for."""
@@ -198,10 +240,10 @@ class FreeModelEstimator:
 
     def collect(self, state: FreeModelState, step_input: StepInput) -> tuple[FreeModelState, bool]:
         """State with the newest measurements of those that a start requires."""
-        return self._collect(state, step_input.t_ns, self._sort(step_input.samples))
+        return self._collect(state, step_input, self._sort(step_input.samples))
 
     def _collect(
-        self, state: FreeModelState, t_ns: int, received: _Received
+        self, state: FreeModelState, step_input: StepInput, received: _Received
     ) -> tuple[FreeModelState, bool]:
         required = [observer.measurements_to_start for observer in self.observers]
         first = tuple(
@@ -210,31 +252,30 @@ class FreeModelEstimator:
         )
         warm = received[self._temperature]
         temperature_c = state.temperature_c if warm is None else warm.value
-        applied = received[self._applied] or state.applied
         state = FreeModelState(
-            t_ns,
+            step_input.t_ns,
             temperature_c,
             first,
             state.observers,
-            applied=applied,
+            inputs=self._update_inputs(state.inputs, step_input.samples),
             bands=state.bands,
         )
         return state, self._can_start(state, required)
 
     def _start_if_possible(
-        self, state: FreeModelState, t_ns: int, received: _Received
+        self, state: FreeModelState, step_input: StepInput, received: _Received
     ) -> tuple[FreeModelState, Estimate | None]:
-        state, can_start = self._collect(state, t_ns, received)
+        state, can_start = self._collect(state, step_input, received)
         return self._start(state) if can_start else (state, None)
 
     def _start(self, state: FreeModelState) -> tuple[FreeModelState, Estimate]:
         """Start the model at the measured heights and at their velocities."""
-        t_ns, first, applied = state.t_ns, state.first, state.applied
+        t_ns, first = state.t_ns, state.first
         starts = [start_of_motion(samples, t_ns) for samples in first]
         heights, velocities = [[item[i] for item in starts] for i in (0, 1)]
-        model = self._plant.init(heights, velocities, t_s=t_ns * 1e-9)
-        applied_n = 0.0 if applied is None else applied.value
-        loaded = self._plant.load(model, (0.0,) * len(first), applied_n, state.temperature_c)
+        inputs = self._input_vector(state.inputs, t_ns)
+        model = self._plant.init(heights, velocities, t_ns * 1e-9, inputs)
+        loaded = self._plant.load(model, (0.0,) * len(first), inputs, state.temperature_c)
         responses = strut_responses(self._plant, heights)
         observers: list[ObserverState] = []
         longest_gaps_ns: list[int] = []
@@ -278,8 +319,9 @@ class FreeModelEstimator:
 
         A velocity is computed from several: they must belong together.
         """
-        if self._has_applied and state.applied is None:
-            return False
+        for item, known in zip(self._inputs, state.inputs, strict=True):
+            if not item.is_ready(known):
+                return False
         for strut, samples in enumerate(state.first):
             if len(samples) != required[strut]:
                 return False
@@ -290,9 +332,15 @@ class FreeModelEstimator:
     def _newest_ns(self, state: FreeModelState) -> int:
         """Time of the oldest of the newest measurements before the model starts."""
         newest_ns = min(samples[-1].t_ns for samples in state.first if samples)
-        if state.applied is None:
-            return newest_ns
-        return min(newest_ns, state.applied.t_ns + self._applied_grace_ns)
+        return min(newest_ns, self._newest_input_ns(state.inputs, newest_ns))
+
+    def _newest_input_ns(self, inputs: Sequence[object], newest_ns: int) -> int:
+        """Time up to which the inputs are known well enough, if that is before `newest_ns`."""
+        for item, known, grace in zip(self._inputs, inputs, self._graces_ns, strict=True):
+            if known is not None:
+                known_ns = item.measured_ns(known) + grace
+                newest_ns = min(newest_ns, known_ns)
+        return newest_ns
 
     def _observe(
         self,
@@ -300,17 +348,17 @@ class FreeModelEstimator:
         loaded: LoadedModel[ModelState],
         step_input: StepInput,
         received: _Received,
+        known_inputs: tuple[object, ...],
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
-        After too long a gap in a height or the applied force, and after a height that contradicts
+        After too long a gap in a height or an input, and after a height that contradicts
         the innovations before, the model starts again from the measurements behind it instead.
         """
         t_ns, before_ns, is_settled = step_input.t_ns, state.t_ns, state.is_settled
-        applied, warm = received[self._applied] or state.applied, received[self._temperature]
-        applied_n = loaded.applied_force_n if applied is None else applied.value
+        inputs, warm = self._input_vector(known_inputs, t_ns), received[self._temperature]
         temperature_c = loaded.temperature_c if warm is None else warm.value
-        model = self._plant.step(loaded, (t_ns - before_ns) * 1e-9, applied_n)
+        model = self._plant.step(loaded, (t_ns - before_ns) * 1e-9, inputs)
         instants: tuple[Instant, ...] = ()
         further: Sequence[tuple[Innovation, ...]] = ()
         if self._oldest_ns:
@@ -318,21 +366,21 @@ class FreeModelEstimator:
             forces_n: Sequence[float] = ()
             if readings:
                 no_forces = (0.0,) * self.struts
-                forces_n = self._plant.load(model, no_forces, applied_n, temperature_c).forces_n
+                forces_n = self._plant.load(model, no_forces, inputs, temperature_c).forces_n
             instants = self._recent_instants(state, loaded, Instant(t_ns, model.struts, forces_n))
             further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
         oldest_ns = t_ns
-        known = self._with_slopes(state.observers, model, applied_n, temperature_c)
+        known = self._with_slopes(state.observers, model, inputs, temperature_c)
         for strut, observer in enumerate(self.observers):
             measured, before, band = received[strut], known[strut], state.bands[strut]
             innovation = None
             if measured is not None:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
-                    return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
+                    return self._start_if_possible(self.restart(state, t_ns), step_input, received)
                 height_m, model_m = measured.value, model.struts[strut][0]
                 if measured_ns != t_ns:
                     before_tick = Instant(before_ns, loaded.state.struts, ())
@@ -352,9 +400,8 @@ class FreeModelEstimator:
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
-        loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
-        if applied is not None and applied.t_ns + self._applied_grace_ns < oldest_ns:
-            oldest_ns = applied.t_ns + self._applied_grace_ns
+        loaded = self._plant.load(model, virtual_n, inputs, temperature_c)
+        oldest_ns = self._newest_input_ns(known_inputs, oldest_ns)
         after = FreeModelState(
             t_ns,
             temperature_c,
@@ -363,7 +410,7 @@ class FreeModelEstimator:
             loaded,
             instants[1:] if instants else state.past,
             state.disturbed_ns,
-            applied,
+            known_inputs,
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
@@ -374,11 +421,11 @@ class FreeModelEstimator:
         self,
         states: Sequence[ObserverState],
         model: ModelState,
-        applied_n: float,
+        inputs: Sequence[float],
         temperature_c: float,
     ) -> Sequence[ObserverState]:
         """States of the observers, which know the slopes of the model's laws where it is now."""
-        slopes = self._plant.slopes(model, applied_n, temperature_c)
+        slopes = self._plant.slopes(model, inputs, temperature_c)
         if slopes is None:
             return states
         return [
@@ -398,7 +445,7 @@ class FreeModelEstimator:
         state = self.restart(replace(state, bands=bands), step_input.t_ns)
         received = self._sort(step_input.samples)
         received[: self.struts] = [None] * self.struts
-        return self._collect(state, step_input.t_ns, received)[0], None
+        return self._collect(state, step_input, received)[0], None
 
     def _has_heights_since(self, t_ns: int, state: FreeModelState) -> bool:
         """Whether heights of every strut have come since a time."""
@@ -436,7 +483,7 @@ class FreeModelEstimator:
         """State and estimate at the end of a step, after which the model is `loaded`."""
         struts: list[StrutOutput] = []
         left_out: tuple[int, ...] = ()
-        size = loaded.applied_force_n
+        size = sum(loaded.inputs)
         is_calm, t_ns, longest_gaps_ns = state.is_settled, state.t_ns, state.longest_gaps_ns
         for strut, observer in enumerate(state.observers):
             if (
@@ -526,9 +573,3 @@ def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]
     powers = np.column_stack([np.ones_like(share), share, share * share])
     height, slope, _ = np.linalg.lstsq(powers, heights, rcond=None)[0]
     return float(height), float(slope) / longest_s
-
-
-def grace_of_applied_force_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
-    """How much older than a height a channel's newest sample may be: its own cycle is longer."""
-    limits_ns = [age_limit_ns(item.interval_ns, stale_after_ns) for item in channels]
-    return max(limits_ns, default=stale_after_ns) - stale_after_ns

@@ -22,7 +22,6 @@ from can_dbc.protection import (
 from can_dbc.units import Dimension
 from rig.bridge.sample_times import Follower, compile_follower, compile_follower_of_times
 from rig.channels.channel import Channel, Role, ValidSignal
-from rig.channels.measured_quantities import APPLIED_FORCE
 
 Values = tuple[float, ...]
 """Values of a frame in SI, in the order of the message's signals that are read."""
@@ -211,7 +210,7 @@ def compile_follower_of(channel: Channel, message: Message) -> Follower | None:
 
 
 def _bears_estimate(channel: Channel) -> bool:
-    return channel.role is not Role.BENCH or channel.quantity is APPLIED_FORCE
+    return channel.role is not Role.BENCH
 
 
 _Check = Callable[[Values], bool]

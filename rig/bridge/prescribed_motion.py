@@ -1,17 +1,12 @@
 """A dyno: the motion is prescribed, and the load cell measures the force it requires.
 
 The model is not free: its strut is moved along the measured motion, and the virtual force is the
-load cell's less that of the model's own law. The motion between and at measurements is followed by
-a filter with fading memory, which has no lag for a constant acceleration.
+load cell's less that of the model's own law.
 
 No model contradicts height and load cell. What does is what is usual of them: the time between two
 samples, and the band of the filter's innovations.
-
-Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
-fading-memory polynomial filter of second degree.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -23,15 +18,13 @@ from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
+from rig.bridge.tracked_motion import SETTLED, TrackedMotion, predict_motion, update_motion
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from rig.observers.protocol import AnyObserver
 
 ModelT = TypeVar("ModelT")
-
-_SETTLED = 9.0
-"""Time constants after which the filter has forgotten that it began at rest: to a hundredth."""
 
 _LONGEST_GAP = 10
 """Intervals after which the motion is followed from the next measurement on, as from the first."""
@@ -69,16 +62,6 @@ class PrescribedModel(Protocol[ModelT]):
         ...
 
 
-class TrackedMotion(Struct, frozen=True, gc=False):
-    """The motion as it is known: derivatives of the height at the last measurement."""
-
-    height_m: float
-    velocity_m_per_s: float
-    acceleration_m_per_s2: float
-    innovation_m: float
-    measured_ns: int
-
-
 class Watched(Struct, frozen=True, gc=False):
     """A channel's last sample, and the time between two of them: 0 before it is known."""
 
@@ -106,36 +89,6 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
     disturbed_ns: int = 0
     band: InnovationBand = InnovationBand()
     is_settled: bool = False
-
-
-def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
-    """The motion after a new measured height; older ones fade with a time constant."""
-    age_s = (sample.t_ns - motion.measured_ns) * 1e-9
-    if age_s <= 0.0:
-        return motion
-    height_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
-    innovation_m = sample.value - height_m
-    kept = math.exp(-age_s / settling_s)
-    fresh = 1.0 - kept
-    return TrackedMotion(
-        height_m + (1.0 - kept**3) * innovation_m,
-        velocity + 1.5 * fresh * fresh * (1.0 + kept) * innovation_m / age_s,
-        acceleration + fresh**3 * innovation_m / (age_s * age_s),
-        innovation_m,
-        sample.t_ns,
-    )
-
-
-def predict_motion(motion: TrackedMotion, t_ns: int) -> tuple[float, float, float]:
-    """Height (m), velocity (m/s) and acceleration (m/s²) at a time after the last measurement."""
-    h = (t_ns - motion.measured_ns) * 1e-9
-    acceleration = motion.acceleration_m_per_s2
-    velocity = motion.velocity_m_per_s + h * acceleration
-    return (
-        motion.height_m + h * (motion.velocity_m_per_s + 0.5 * h * acceleration),
-        velocity,
-        acceleration,
-    )
 
 
 def _motion_at(motion: TrackedMotion, t_s: float) -> tuple[float, float]:
@@ -201,7 +154,7 @@ class PrescribedMotionEstimator:
 
     def heights_m(self, state: PrescribedMotionState) -> Sequence[float]:
         """Last measured height as it is filtered; empty before the first one."""
-        return () if state.motion is None else (state.motion.height_m,)
+        return () if state.motion is None else (state.motion.position_m,)
 
     def step(
         self, state: PrescribedMotionState, step_input: StepInput
@@ -223,7 +176,7 @@ class PrescribedMotionEstimator:
         strut = StrutOutput(cell_n, virtual_n, True, height_m, velocity, acceleration, innovation_m)
         diverged = -1 if is_sensible(cell_n + model_n + height_m + velocity) else 0
         is_settled = (
-            (t_ns - state.disturbed_ns) * 1e-9 >= _SETTLED * self._settling_s
+            (t_ns - state.disturbed_ns) * 1e-9 >= SETTLED * self._settling_s
             and not self._is_old(height, t_ns)
             and not self._is_old(cell, t_ns)
         )

@@ -105,12 +105,13 @@ class MeasuredSignal(SignalName):
 class Role(Enum):
     """What a step does with a channel's samples.
 
-    HEIGHT is the reference height of a strut, SENSOR a further sensor of a strut, and BENCH a
-    quantity of which the bench has one.
+    HEIGHT is the reference height of a strut, SENSOR a further sensor of a strut, INPUT drives the
+    model, and BENCH is any other quantity, of which the bench has one.
     """
 
     HEIGHT = "height"
     SENSOR = "sensor"
+    INPUT = "input"
     BENCH = "bench"
 
 
@@ -121,8 +122,9 @@ class Channel:
     Attributes:
         index: Position among the channels of the plan.
         name: Its name in messages to the user, and in the log what stands before the dot of its
-            columns: a strut, or a strut and a sensor; of a quantity of the bench its key.
-        strut: Index of the strut that it is of; -1 for a quantity of the bench.
+            columns: a strut, or a strut and a sensor; of a quantity of the bench its key; of an
+            input its name, with a dot and what is measured in addition to it.
+        strut: Index of the strut that it is of; -1 for any other.
         delay_ns: How much later a sample arrives than it is true.
         noise_std: Standard deviation of a sample in SI, quantisation included; of a further sensor.
         message: Message that carries it; None for a channel that is on no bus.
@@ -150,7 +152,9 @@ class Channel:
     @property
     def column(self) -> str:
         """Its column in the log."""
-        if self.role is Role.BENCH:
+        if self.role is Role.INPUT and self.name != self.quantity.key:
+            return f"{self.quantity.column}:{self.name.partition('.')[0]}"
+        if self.role in (Role.BENCH, Role.INPUT):
             return self.quantity.column
         return f"{self.name}.measured_{self.quantity.column}"
 

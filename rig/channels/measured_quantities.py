@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from can_dbc.units import Dimension
+from dart_model.spec import ForceInput, MotionInput, TorqueInput
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,34 @@ APPLIED_FORCE = Quantity(
     Dimension.FORCE,
     "force that the actuator applies to the body, positive upwards, without the weight",
 )
+APPLIED_TORQUE = Quantity(
+    "applied_torque",
+    "applied_torque_n_m",
+    Dimension.TORQUE,
+    "torque that the actuator applies to the joint, positive about the joint's axis",
+)
+MOTION = Quantity("motion", "motion_m", Dimension.LENGTH, "position of a body that is moved")
+ACCELERATION = Quantity(
+    "acceleration",
+    "acceleration_m_per_s2",
+    Dimension.ACCELERATION,
+    "acceleration of a body that is moved",
+)
+INPUT_QUANTITIES = (APPLIED_FORCE, APPLIED_TORQUE, MOTION, ACCELERATION)
+"""What may be measured of the inputs of a model, by name."""
+
+
+def quantity_of(item: ForceInput | TorqueInput | MotionInput) -> Quantity:
+    """What is measured of an input of a model."""
+    match item:
+        case ForceInput():
+            return APPLIED_FORCE
+        case TorqueInput():
+            return APPLIED_TORQUE
+        case MotionInput():
+            return MOTION
+
+
 LOAD_CELL_FORCE = Quantity(
     "load_cell_force",
     "strut_force_n",

@@ -146,7 +146,7 @@ def _gaps_of(ended: "Ended", folder: Path) -> "Gaps | None":
     if is_whole or _is_long(ended):
         return None
     with contextlib.suppress(InputError):  # `rig diagnose` reports what is wrong with a recording
-        return read_run(folder).force_gaps
+        return read_run(folder).gaps
     return None
 
 

@@ -54,7 +54,7 @@ def evaluate_command(
     for name, spec in zip(model, specs, strict=True):
         struts = tuple(strut.name for strut in spec.struts)
         recordings = [read_once(path, struts) for path in runs]
-        gaps = {item.name: item.force_gaps for item in recordings if item.force_gaps is not None}
+        gaps = {item.name: item.gaps for item in recordings if item.gaps is not None}
         for recording in recordings:
             try:
                 rows += [(name, it) for it in evaluate_model(spec, [recording])]

@@ -204,10 +204,8 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
 
 def _cycle_of_applied_force_ms(plan: "Plan") -> float:
     """Cycle of the applied force's message; 0 without one."""
-    from rig.channels.measured_quantities import APPLIED_FORCE
-
-    channel = plan.bench_channel(APPLIED_FORCE)
-    return 0.0 if channel is None else 1e-6 * channel.interval_ns
+    cycles = [item.channel.interval_ns for item in plan.inputs if item.channel is not None]
+    return 1e-6 * max(cycles, default=0)
 
 
 def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> None:

@@ -117,7 +117,8 @@ class Loop:
         self._plant, self._observers, self._timing = plant, tuple(observers), timing
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
-        self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
+        self._no_inputs = (0.0,) * plant.inputs
+        self._law_n = plant.load(start, [0.0] * plant.struts, self._no_inputs, AMBIENT_C).forces_n
         self._responses = responses or strut_responses(plant, heights_m)
         self._states = [
             self._steady_state(observer, response)
@@ -176,8 +177,8 @@ class Loop:
         for tick in range(1, timing.measured_every + 1):
             acting = [state.virtual_force_n for state in states]
             acting[strut] -= residual_n
-            loaded = self._plant.load(model, acting, 0.0, AMBIENT_C)
-            model = self._plant.step(loaded, timing.period_ns * 1e-9, 0.0)
+            loaded = self._plant.load(model, acting, self._no_inputs, AMBIENT_C)
+            model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
             now = [height_m for height_m, _ in model.struts]
             t_ns = tick * timing.period_ns
             innovations: list[Innovation | None] = [None] * count
@@ -199,7 +200,7 @@ class Loop:
                     self._observers, states, innovations, strict=True
                 )
             ]
-        law_n = self._plant.load(model, [0.0] * count, 0.0, AMBIENT_C).forces_n[strut]
+        law_n = self._plant.load(model, [0.0] * count, self._no_inputs, AMBIENT_C).forces_n[strut]
         error_n = law_n - self._law_n[strut] + states[strut].residual_force_n - residual_n
         numbers = [
             observer.numbers(state) for observer, state in zip(self._observers, states, strict=True)
@@ -215,7 +216,7 @@ class Loop:
         def slopes_at(velocity_m_per_s: float) -> Array:
             moving, bench_m = self._moving(velocity_m_per_s)
             model = self._plant.state_of(moving[: self._ends[1]].tolist())
-            slopes = self._plant.slopes(model, 0.0, AMBIENT_C)
+            slopes = self._plant.slopes(model, self._no_inputs, AMBIENT_C)
 
             def after(u: Array) -> Array:
                 noise_m, residual_n = u[size:].tolist()
@@ -244,8 +245,8 @@ class Loop:
         if timing.delay:
             return moving, past_m[-count:]
         for _ in range(timing.measured_every):
-            loaded = self._plant.load(model, [0.0] * count, 0.0, AMBIENT_C)
-            model = self._plant.step(loaded, timing.period_ns * 1e-9, 0.0)
+            loaded = self._plant.load(model, [0.0] * count, self._no_inputs, AMBIENT_C)
+            model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
         return moving, [height_m for height_m, _ in model.struts]
 
     def _steady_state(self, observer: Observer[StateT], response: StrutResponse) -> StateT:

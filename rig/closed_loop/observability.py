@@ -79,12 +79,12 @@ class LinearModel(NamedTuple):
 def linear_model(plant: AnyPlant, heights_m: Sequence[float]) -> LinearModel:
     """A model about rest at some heights of all its struts."""
     start = np.array(plant.numbers(plant.init(heights_m)))
-    nothing = np.zeros(plant.struts)
+    nothing, no_inputs = np.zeros(plant.struts), (0.0,) * plant.inputs
 
     def after(x: Array, forces_n: Array) -> Array:
         state = plant.state_of(x.tolist())
-        loaded = plant.load(state, forces_n.tolist(), 0.0, AMBIENT_C)
-        return np.array(plant.numbers(plant.step(loaded, _TIME_S, 0.0)))
+        loaded = plant.load(state, forces_n.tolist(), no_inputs, AMBIENT_C)
+        return np.array(plant.numbers(plant.step(loaded, _TIME_S, no_inputs)))
 
     def heights(x: Array) -> Array:
         return np.array([height_m for height_m, _ in plant.state_of(x.tolist()).struts])

@@ -45,13 +45,13 @@ def strut_responses(plant: AnyPlant, heights_m: Sequence[float]) -> list[StrutRe
 
 
 def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int) -> StrutResponse:
-    alone = np.eye(plant.struts)[index]
+    alone, no_inputs = np.eye(plant.struts)[index], (0.0,) * plant.inputs
 
     def acceleration(u: NDArray[np.float64]) -> NDArray[np.float64]:
         force_n, height_m, velocity_m_per_s = u.tolist()
         heights, velocities = heights_m + height_m * alone, velocity_m_per_s * alone
         state = plant.init(heights.tolist(), velocities.tolist())
-        loaded = plant.load(state, (force_n * alone).tolist(), 0.0, AMBIENT_C)
+        loaded = plant.load(state, (force_n * alone).tolist(), no_inputs, AMBIENT_C)
         return np.array([loaded.accelerations_m_per_s2[index]])
 
     ((mobility, stiffness, damping),) = central_differences(
@@ -73,7 +73,8 @@ def _find_driving_speed(plant: AnyPlant, heights_m: Sequence[float], index: int)
     def force_n(velocity_m_per_s: float) -> float:
         velocities = (velocity_m_per_s * np.eye(plant.struts)[index]).tolist()
         state = plant.init(list(heights_m), velocities)
-        return plant.load(state, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n[index]
+        no_inputs = (0.0,) * plant.inputs
+        return plant.load(state, [0.0] * plant.struts, no_inputs, AMBIENT_C).forces_n[index]
 
     rest_n = force_n(0.0)
     for speed in _SPEEDS_M_PER_S.tolist():

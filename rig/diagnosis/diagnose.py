@@ -65,7 +65,7 @@ def diagnose(
     problems = build_problems(spec, runs, held_out, criteria.blocks, criteria.held_out_every)
     result = _diagnose_problems(problems, criteria, progress)
     progress("done", 1.0)
-    gaps = (run.force_gaps.report(run.name) for run in (*runs, *held_out) if run.force_gaps)
+    gaps = (run.gaps.report(run.name) for run in (*runs, *held_out) if run.gaps)
     diagnosis = result.diagnosis
     return replace(result, diagnosis=replace(diagnosis, notes=(*diagnosis.notes, *gaps)))
 

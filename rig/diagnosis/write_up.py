@@ -393,7 +393,7 @@ def _collect_series(
 
 
 def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[str, ...]:
-    notes = [problem.assumption]
+    notes = [*problem.assumptions]
     if outliers := sum({grid.recording: grid.outliers for grid in problem.grids}.values()):
         notes.append(f"{outliers} heights are outliers and were removed.")
     if search.gain_alike:

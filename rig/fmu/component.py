@@ -338,7 +338,7 @@ class _Guide(NamedTuple):
 
 def _guide(spec: ModelSpec) -> _Guide:
     plant = DartPlant(spec)
-    if plant.coordinates != 1 or not plant.is_constant:
+    if plant.coordinates != 1 or plant.inputs != 1 or not plant.is_constant:
         raise InputError(
             f"model {spec.name}: {plant.coordinates} joint coordinates, expected one on a straight "
             "guide for a bench as an FMU (a strut alone can always be exported)"
@@ -357,7 +357,7 @@ def _guide(spec: ModelSpec) -> _Guide:
         mass_kg,
         weight / mass_kg,
         added,
-        float(jacobians.applied[0] / rows[0]),
+        float(jacobians.inputs[0, 0] / rows[0]),
         ratios.tolist(),
         (offsets - ratios * offsets[0]).tolist(),
         rest.struts[0][0],

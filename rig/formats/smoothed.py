@@ -150,10 +150,10 @@ def _mobility(run: RunFolder, plan: Plan, names: list[str]) -> Array:
             "along straight guides"
         )
     rest = plant.numbers(plant.init([strut.free_length_m for strut in plan.struts]))
-    state = plant.state_of([0.0] * len(rest))
+    state, no_inputs = plant.state_of([0.0] * len(rest)), (0.0,) * plant.inputs
 
     def accelerations(virtual_n: Array) -> Array:
-        loaded = plant.load(state, tuple(virtual_n.tolist()), 0.0, AMBIENT_C)
+        loaded = plant.load(state, tuple(virtual_n.tolist()), no_inputs, AMBIENT_C)
         return np.array(loaded.accelerations_m_per_s2)
 
     free = accelerations(np.zeros(len(names)))

@@ -59,12 +59,12 @@ class Step(Struct, frozen=True, gc=False):
 class LogColumns:
     """Columns of a run's log, and the numbers of a tick in their order.
 
-    First stand the quantities of the bench, then the struts, then the further sensors.
-    The indices of the bench's channels are their positions.
+    First stand inputs and quantities of the bench, then the struts, then the further sensors.
+    The indices of the channels are their positions.
     """
 
     def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:
-        bench = [channel for channel in channels if channel.role is Role.BENCH]
+        bench = [channel for channel in channels if channel.role in (Role.BENCH, Role.INPUT)]
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
         first = [len(bench) + i * len(STRUT_COLUMNS) for i in range(len(struts))]
         begin_of_sensors = len(bench) + len(struts) * len(STRUT_COLUMNS)

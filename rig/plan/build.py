@@ -12,6 +12,7 @@ from rig.bridge.bridge import Bridge
 from rig.bridge.estimator import AnyEstimator
 from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
 from rig.bridge.incoming_messages import Alarm, Incoming, compile_incoming
+from rig.bridge.measured_inputs import AnyInput, HeldInput, MovedInput
 from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
@@ -20,7 +21,7 @@ from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.settling import settling_times_ns
 from rig.observers.protocol import AnyObserver
-from rig.plan.plan import Plan
+from rig.plan.plan import Plan, PlannedInput
 
 ENGINES: Mapping[str, Callable[[ModelSpec], AnyPlant]] = MappingProxyType({"dart": DartPlant})
 """`engine` in a configuration -> what makes a plant of a model. A further one is a line here."""
@@ -73,10 +74,17 @@ def _build_estimator(plan: Plan) -> AnyEstimator:
         plant,
         plan.observers,
         plan.channels,
+        [_measured_input(item) for item in plan.inputs],
         stale_after_ns,
         settling_times(plan),
         plan.config.supervision.settling_s,
     )
+
+
+def _measured_input(item: PlannedInput) -> AnyInput:
+    if item.is_motion and item.channel is not None:
+        return MovedInput(item.channel, item.acceleration, item.settling_s)
+    return HeldInput(item.channel)
 
 
 def sample_timing(plan: Plan) -> SampleTiming:

@@ -20,6 +20,7 @@ from pydantic_core.core_schema import tagged_union_schema
 from can_dbc.errors import expected_name
 from can_dbc.units import Dimension
 from can_dbc.yaml_file import Finite, Positive
+from dart_model.spec import InputName
 from rig.bridge.devices import DeviceSettings
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING, Publication
@@ -41,7 +42,10 @@ from rig.machine.realtime import Realtime
 from rig.observers import DEFAULT_KIND, OBSERVERS
 from rig.observers.protocol import AnyObserver
 
-_KEYS = (HEIGHT.key, "further", *(quantity.key for quantity in BENCH_QUANTITIES))
+_KEYS = (HEIGHT.key, "inputs", "further", *(quantity.key for quantity in BENCH_QUANTITIES))
+
+DEFAULT_SETTLING_S = 0.002
+"""Time constant of a filter that follows a motion: two samples at 1 kHz."""
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 """Folder of the configurations that come with the package."""
@@ -107,6 +111,30 @@ class HeightSignal(MeasuredSignal):
     def delay_ns(self) -> int:
         """The delay in ns."""
         return round(self.delay_s * 1e9)
+
+
+class InputSignal(HeightSignal):
+    """Where an input of the model stands on the bus: a force, a torque, or a measured motion.
+
+    Attributes:
+        zero: Only for a motion: a reading at a known position; if absent, the reading is the
+            position.
+        reversed: True if the reading falls while the quantity grows; for a motion it requires
+            `zero`.
+        tare_n: Only for a force: reading without a force, in N after the scaling by the DBC and
+            before a reversal; 0 if absent.
+        delay_s: Time from the instant that the value describes to the arrival of its frame.
+        acceleration: Only for a motion: where the measured acceleration of the body stands; if
+            absent, the acceleration follows from the positions.
+        settling_s: Only for a motion: time constant T of the filter that computes velocity and
+            acceleration from the positions. The relative error of the velocity is about
+            3 (T omega)^2 at the angular frequency omega of the motion.
+    """
+
+    refused_keys: ClassVar[frozenset[str]] = frozenset()
+
+    acceleration: MeasuredSignal | None = None
+    settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = DEFAULT_SETTLING_S
 
 
 class SensorSignal(HeightSignal):
@@ -175,6 +203,8 @@ class Signals(_Frozen):
 
     Attributes:
         height: Measured height of each strut, by strut name.
+        inputs: Inputs of the model, by their names in the model file. A model without `inputs`
+            has a single force, whose signal is `applied_force`.
         further: Further sensors of a strut, by the names of strut and sensor.
         QUANTITY: A quantity for which the bench has one signal, such as `applied_force`, by its
             key in the table of measured quantities.
@@ -186,6 +216,9 @@ class Signals(_Frozen):
     )
 
     height: Annotated[dict[StrutKey, HeightSignal], Field(min_length=1)]
+    inputs: dict[Annotated[InputName, KeyName("INPUT")], InputSignal] = Field(
+        default_factory=dict[str, InputSignal]
+    )
     further: dict[
         StrutKey,
         dict[
@@ -220,7 +253,7 @@ class PrescribedMotion(_Frozen):
             the motion.
     """
 
-    settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = 0.002
+    settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = DEFAULT_SETTLING_S
 
 
 _Observer = Annotated[AnyObserver, OneOf("kind", OBSERVERS, DEFAULT_KIND)]
@@ -384,6 +417,10 @@ class RunConfig(_Frozen):
             )
         if LOAD_CELL_FORCE not in self.signals.bench:
             raise ValueError("prescribed_motion: requires signals.load_cell_force")
+        if self.signals.inputs:
+            raise ValueError(
+                "signals.inputs: expected none with prescribed_motion, which has no other drive"
+            )
         if APPLIED_FORCE in self.signals.bench:
             raise ValueError(
                 "prescribed_motion: expected no signals.applied_force, because a prescribed motion "

@@ -17,7 +17,6 @@ from can_dbc.errors import DatabaseError, InputError, expected_name
 from can_dbc.units import Dimension
 from rig.bridge.supervision_limits import Limit, LimitedValue, Limits
 from rig.channels.channel import Channel, Role
-from rig.channels.measured_quantities import APPLIED_FORCE
 
 _MARGIN = 0.1
 """Of a height's span, by which the model may leave it: the innovation is that large at most."""
@@ -164,7 +163,7 @@ def _of_height(channel: Channel) -> Iterator[Limit]:
 
 def _of_channel(channel: Channel) -> Iterator[Limit]:
     """The limit that follows from a signal that the estimate rests on."""
-    if channel.role is Role.SENSOR or channel.quantity is APPLIED_FORCE:
+    if channel.role in (Role.SENSOR, Role.INPUT):
         yield from _of_range(channel, channel.name, LimitedValue.MEASURED)
 
 

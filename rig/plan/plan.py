@@ -32,10 +32,26 @@ from rig.bridge.published_quantities import (
 from rig.bridge.supervision_limits import Limits
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName
-from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, Quantity
+from rig.channels.measured_quantities import (
+    ACCELERATION,
+    APPLIED_FORCE,
+    HEIGHT,
+    LOAD_CELL_FORCE,
+    MOTION,
+    Quantity,
+    quantity_of,
+)
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
-from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal, Signals
+from rig.plan.config import (
+    DEFAULT_SETTLING_S,
+    HeightSignal,
+    InputSignal,
+    Mapped,
+    RunConfig,
+    SensorSignal,
+    Signals,
+)
 from rig.plan.limits import resolve_limits
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
@@ -63,6 +79,25 @@ class PlannedStrut:
 
 
 @dataclass(frozen=True)
+class PlannedInput:
+    """An input of the model as the bridge drives it.
+
+    Attributes:
+        name: Its name in the model.
+        is_motion: Whether a body is moved; else a force or a torque acts.
+        channel: Channel that measures it; None for the single force of a bench that sends none.
+        acceleration: Channel of a motion's measured acceleration, if it is measured.
+        settling_s: Time constant of the filter that follows a motion.
+    """
+
+    name: str
+    is_motion: bool
+    channel: Channel | None
+    acceleration: Channel | None
+    settling_s: float
+
+
+@dataclass(frozen=True)
 class PlannedMessage:
     """A message that the bridge sends, and what its signals publish."""
 
@@ -76,7 +111,8 @@ class Plan:
 
     Attributes:
         config: The configuration, with every strut and every published signal named.
-        channels: Channels of the bench: heights, quantities of the bench, further sensors.
+        inputs: Inputs of the model, in its order.
+        channels: Channels of the bench: heights, inputs, quantities of the bench, further sensors.
         alarms: Messages with alarms of the devices, and the alarms.
         limits: Limits: the configured ones, and those that follow from the DBC.
         authentication: How frames are authenticated; None where they are not, and for the plan of
@@ -88,6 +124,7 @@ class Plan:
     model: ModelSpec
     database: Database
     struts: tuple[PlannedStrut, ...]
+    inputs: tuple[PlannedInput, ...]
     channels: tuple[Channel, ...]
     outgoing: tuple[PlannedMessage, ...]
     devices: tuple[Device, ...]
@@ -127,9 +164,11 @@ class Plan:
 
     @property
     def has_force(self) -> bool:
-        """Whether a run of it can be diagnosed: a force was measured with the heights."""
-        forces = (APPLIED_FORCE, LOAD_CELL_FORCE)
-        return any(channel.quantity in forces for channel in self.channels)
+        """Whether a run of it can be diagnosed: what drives it, or a load cell, was measured."""
+        return any(
+            channel.role is Role.INPUT or channel.quantity is LOAD_CELL_FORCE
+            for channel in self.channels
+        )
 
     def bench_channel(self, quantity: Quantity) -> Channel | None:
         """Channel of a quantity of the bench; None where it is not measured."""
@@ -186,7 +225,9 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         DatabaseError: The same, of the DBC.
     """
     config = _with_names(config, model, database, source)
-    reader = _SignalReader(config, _calibrate(config.signals, database, source), source)
+    applied = _input_of_applied_force(config, model, source)
+    calibrated = _calibrate(config.signals, _quantities(model), database, source)
+    reader = _SignalReader(config, model, applied, calibrated, source)
     channels = reader.channels()
     outgoing = reader.outgoing()
     alarms = reader.alarms()
@@ -202,6 +243,7 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         model,
         database,
         _struts(config, model, channels),
+        _inputs(config, model, applied, channels),
         channels,
         outgoing,
         _devices(config, channels),
@@ -339,11 +381,13 @@ _AS_READ = Calibration()
 """Of a sensor of which nothing is stated: what it reads is what is measured."""
 
 
-def _calibrate(signals: Signals, database: Database, source: Path) -> Database:
+def _calibrate(
+    signals: Signals, inputs: Mapping[str, Quantity], database: Database, source: Path
+) -> Database:
     """The DBC with the zeros, directions and tares that a configuration states."""
     known: dict[tuple[str, str], tuple[str, Calibration]] = {}
     messages = dict(database.messages)
-    for key, quantity, entry in _measured(signals):
+    for key, quantity, entry in _measured(signals, inputs):
         _check_calibration(entry, quantity, f"{source}: {key}")
         message, signal = messages.get(entry.message), entry.signal
         if message is None or signal not in message.signals:
@@ -360,10 +404,17 @@ def _calibrate(signals: Signals, database: Database, source: Path) -> Database:
     return replace(database, messages=messages)
 
 
-def _measured(signals: Signals) -> Iterator[tuple[str, Quantity, MeasuredSignal]]:
+def _measured(
+    signals: Signals, inputs: Mapping[str, Quantity]
+) -> Iterator[tuple[str, Quantity, MeasuredSignal]]:
     """Everything that is measured: its key, its quantity, and where it stands."""
     for strut, entry in signals.height.items():
         yield f"signals.height.{strut}", HEIGHT, entry
+    for name, entry in signals.inputs.items():
+        if name in inputs:
+            yield f"signals.inputs.{name}", inputs[name], entry
+            if entry.acceleration is not None:
+                yield f"signals.inputs.{name}.acceleration", ACCELERATION, entry.acceleration
     for quantity, entry in signals.bench.items():
         yield f"signals.{quantity.key}", quantity, entry
     for strut, group in signals.further.items():
@@ -371,7 +422,13 @@ def _measured(signals: Signals) -> Iterator[tuple[str, Quantity, MeasuredSignal]
             yield f"signals.further.{strut}.{sensor}", entry.quantity, entry
 
 
-_REVERSIBLE = (Dimension.LENGTH, Dimension.VELOCITY, Dimension.ACCELERATION, Dimension.FORCE)
+_REVERSIBLE = (
+    Dimension.LENGTH,
+    Dimension.VELOCITY,
+    Dimension.ACCELERATION,
+    Dimension.FORCE,
+    Dimension.TORQUE,
+)
 
 
 def _check_calibration(entry: MeasuredSignal, quantity: Quantity, key: str) -> None:
@@ -396,16 +453,27 @@ def _check_calibration(entry: MeasuredSignal, quantity: Quantity, key: str) -> N
 
 
 class _SignalReader:
-    """Looks the configured signals up in the DBC, each once; `read` has those it reads, by key."""
+    """Looks the configured signals up in the DBC, each once; `read` has those it reads, by key.
 
-    def __init__(self, config: RunConfig, database: Database, source: Path) -> None:
+    `applied` is the input of the model that the applied force is; None where none is measured.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        model: ModelSpec,
+        applied: str | None,
+        database: Database,
+        source: Path,
+    ) -> None:
         self._config, self._database, self._source = config, database, source
+        self._quantities, self._applied = _quantities(model), applied
         self._used = [(item.message, item.signal) for item in config.signals.height.values()]
         self._of_sender: dict[tuple[str, str], str | None] = {}
         self.read: dict[str, Message] = {}
 
     def channels(self) -> tuple[Channel, ...]:
-        """Channels of the bench: heights, quantities of the bench, further sensors."""
+        """Channels of the bench: heights, inputs, quantities of the bench, further sensors."""
         signals, struts = self._config.signals, list(self._config.observers)
         channels: list[Channel] = []
 
@@ -442,6 +510,14 @@ class _SignalReader:
             index, key = struts.index(strut), f"signals.height.{strut}"
             add(Role.HEIGHT, HEIGHT, strut, key, index, entry)
         measured: dict[tuple[str, str], str] = {}
+        for name, entry in signals.inputs.items():
+            key, quantity = f"signals.inputs.{name}", self._quantities[name]
+            self._check_input(entry, quantity, key)
+            add(Role.INPUT, quantity, name, key, -1, entry)
+            measured[entry.message, entry.signal] = f"inputs.{name}"
+            if entry.acceleration is not None:
+                further, key = f"{name}.acceleration", f"{key}.acceleration"
+                add(Role.INPUT, ACCELERATION, further, key, -1, entry.acceleration)
         for quantity, entry in signals.bench.items():
             other = measured.setdefault((entry.message, entry.signal), quantity.key)
             if other != quantity.key:
@@ -449,7 +525,8 @@ class _SignalReader:
                     f"{self._source}: signals.{quantity.key}: {entry.message}.{entry.signal} is "
                     f"{other} already, expected another signal"
                 )
-            add(Role.BENCH, quantity, quantity.key, f"signals.{quantity.key}", -1, entry)
+            role = Role.INPUT if quantity is APPLIED_FORCE else Role.BENCH
+            add(role, quantity, quantity.key, f"signals.{quantity.key}", -1, entry)
         for strut, group in signals.further.items():
             for sensor, entry in group.items():
                 self._check_sensor(strut, sensor)
@@ -601,6 +678,16 @@ class _SignalReader:
                 f"least {SHORTEST_ROUND} cycles of {cycle_s:g} s (is its range in the DBC right?)"
             )
 
+    def _check_input(self, entry: InputSignal, quantity: Quantity, key: str) -> None:
+        """Refuse what only a motion has."""
+        if quantity is MOTION:
+            return
+        for field in ("acceleration", "settling_s"):
+            if field in entry.model_fields_set:
+                raise InputError(
+                    f"{self._source}: {key}.{field}: expected none, because the input is no motion"
+                )
+
     def _check_sensor(self, strut: str, sensor: str) -> None:
         """Refuse a further sensor whose signal is in use, or whose delay differs too much."""
         signals = self._config.signals
@@ -637,13 +724,79 @@ def _struts(
     return tuple(struts)
 
 
+# --- Inputs -------------------------------------------------------------------------------------
+
+
+def _quantities(model: ModelSpec) -> dict[str, Quantity]:
+    """What is measured of each input of a model, by its name."""
+    return {name: quantity_of(item) for name, item in model.drive.items()}
+
+
+def _input_of_applied_force(config: RunConfig, model: ModelSpec, source: Path) -> str | None:
+    """The input of the model that `signals.applied_force` is; None where it is not measured.
+
+    Raises:
+        InputError: An input is not the model's, is measured twice, or is not measured.
+    """
+    signals, quantities = config.signals, _quantities(model)
+    for name in signals.inputs:
+        if name not in quantities or model.inputs is None:
+            expected = expected_name(name, list(model.inputs or ()))
+            if model.inputs is None:
+                expected = f"the model has no inputs, expected signals.{APPLIED_FORCE.key}"
+            raise InputError(f"{source}: signals.inputs.{name}: {expected}")
+    measured = set(signals.inputs)
+    applied = None
+    if APPLIED_FORCE in signals.bench:
+        forces = [name for name, quantity in quantities.items() if quantity is APPLIED_FORCE]
+        if len(forces) != 1 or forces[0] in measured:
+            raise InputError(
+                f"{source}: signals.{APPLIED_FORCE.key}: expected signals.inputs with each input "
+                f"of the model by its name: {', '.join(quantities)}"
+            )
+        applied = forces[0]
+        measured.add(applied)
+    if model.inputs is not None and config.prescribed_motion is None:
+        for name in quantities:
+            if name not in measured:
+                raise InputError(
+                    f"{source}: signals.inputs.{name}: is missing, expected its signal, because "
+                    "the model has this input"
+                )
+    return applied
+
+
+def _inputs(
+    config: RunConfig, model: ModelSpec, applied: str | None, channels: Sequence[Channel]
+) -> tuple[PlannedInput, ...]:
+    by_name = {channel.name: channel for channel in channels if channel.role is Role.INPUT}
+    planned: list[PlannedInput] = []
+    for name, quantity in _quantities(model).items():
+        entry = config.signals.inputs.get(name)
+        planned.append(
+            PlannedInput(
+                name,
+                quantity is MOTION,
+                by_name.get(APPLIED_FORCE.key if name == applied else name),
+                by_name.get(f"{name}.acceleration"),
+                DEFAULT_SETTLING_S if entry is None else entry.settling_s,
+            )
+        )
+    return tuple(planned)
+
+
 # --- Devices and authentication -----------------------------------------------------------------
 
 
 def vital_channels(config: RunConfig, channels: Sequence[Channel]) -> list[Channel]:
-    """Those that an estimate rests on: heights, and the force that is measured with them."""
-    force = APPLIED_FORCE if config.prescribed_motion is None else LOAD_CELL_FORCE
-    return [it for it in channels if it.role is Role.HEIGHT or it.quantity is force]
+    """Those that an estimate rests on: heights, and what drives the bench or its load cell."""
+    is_prescribed = config.prescribed_motion is not None
+    return [
+        it
+        for it in channels
+        if it.role in (Role.HEIGHT, Role.INPUT)
+        or (is_prescribed and it.quantity is LOAD_CELL_FORCE)
+    ]
 
 
 def _devices(config: RunConfig, channels: Sequence[Channel]) -> tuple[Device, ...]:

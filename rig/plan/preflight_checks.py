@@ -11,13 +11,13 @@ from can_dbc.database import Message
 from can_dbc.errors import InputError
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton, shipped_models
-from rig.bridge.free_model import grace_of_applied_force_ns
 from rig.bridge.incoming_messages import ClockSource, clock_source
+from rig.bridge.measurement_age import age_limit_ns
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_interface
 from rig.channels.channel import Channel, Role
-from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
@@ -98,7 +98,7 @@ def check(plan: Plan) -> list[Finding]:
         ],
         _staleness(plan, heights),
         *_switches(plan),
-        *_applied_force(plan),
+        *_inputs(plan),
         *_interface(plan),
         *_watchdog(plan),
         *_publication(plan),
@@ -143,7 +143,7 @@ def _protection(plan: Plan, message: Message) -> Finding:
     what, protection = f"protection of {message.name}", message.protection
     if protection is None:
         signals = plan.config.signals
-        entries = [*signals.height.values(), *signals.bench.values()]
+        entries = [*signals.height.values(), *signals.inputs.values(), *signals.bench.values()]
         entries += [entry for group in signals.further.values() for entry in group.values()]
         own = [entry for entry in entries if entry.message == message.name]
         text = "none in the DBC: a corrupted, repeated or foreign frame passes as data"
@@ -309,20 +309,22 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
     return Finding(severity, "supervision.stale_after_s", text)
 
 
-def _applied_force(plan: Plan) -> list[Finding]:
-    """When the applied force counts as missing."""
-    channel = plan.bench_channel(APPLIED_FORCE)
-    if channel is None:
-        return []
-    stale_ns = plan.config.supervision.stale_after_ns
-    grace_ns = grace_of_applied_force_ns([channel], stale_ns)
-    text = f"missing after {(stale_ns + grace_ns) * 1e-6:g} ms"
-    if _message(channel).cycle_time_ns is None:
-        text += f": the DBC gives {_message(channel).name} no cycle time"
-        return [Finding(Severity.WARNING, channel.key, text)]
-    is_long = stale_ns + grace_ns > plan.config.supervision.safe_after_ns
-    severity = Severity.WARNING if is_long else Severity.OK
-    return [Finding(severity, channel.key, text)]
+def _inputs(plan: Plan) -> list[Finding]:
+    """When an input counts as missing."""
+    findings: list[Finding] = []
+    for channel in (item.channel for item in plan.inputs):
+        if channel is None:
+            continue
+        stale_ns = plan.config.supervision.stale_after_ns
+        limit_ns = age_limit_ns(channel.interval_ns, stale_ns)
+        text = f"missing after {limit_ns * 1e-6:g} ms"
+        is_long = limit_ns > plan.config.supervision.safe_after_ns
+        severity = Severity.WARNING if is_long else Severity.OK
+        if _message(channel).cycle_time_ns is None:
+            text += f": the DBC gives {_message(channel).name} no cycle time"
+            severity = Severity.WARNING
+        findings.append(Finding(severity, channel.key, text))
+    return findings
 
 
 def _switches(plan: Plan) -> list[Finding]:

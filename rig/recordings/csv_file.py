@@ -6,14 +6,23 @@ from pathlib import Path
 import numpy as np
 
 from can_dbc.errors import InputError, expected_name
+from rig.channels.measured_quantities import (
+    ACCELERATION,
+    APPLIED_FORCE,
+    APPLIED_TORQUE,
+    INPUT_QUANTITIES,
+    MOTION,
+)
 from rig.files.delimited_text import read_csv_columns
 from rig.recordings.gaps import find_gaps
-from rig.recordings.recording import Array, Recording, RecordingError
+from rig.recordings.recording import Array, RecordedInput, Recording, RecordingError
 
 COLUMNS = ("t_s", "height_m", "applied_force_n", "strut_force_n", "temperature_c")
 """Columns of a CSV file. Heights and strut forces may name their strut: ``height_m:tyre``."""
 
 _OF_A_STRUT = ("height_m", "strut_force_n")
+_OF_AN_INPUT = tuple(quantity.column for quantity in INPUT_QUANTITIES)
+"""Columns that name an input of the model: ``motion_m:road``; the only force needs no name."""
 _LARGEST_BYTES = 2_000_000_000
 """Ten minutes, the longest recording, at 50 kHz in five columns of twelve characters."""
 
@@ -44,13 +53,37 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         name,
         values["t_s"],
         np.column_stack([height for height in heights if height is not None]),
-        values.get("applied_force_n"),
+        _inputs_of(name, values),
         _stack_columns(cells, samples),
         values.get("temperature_c"),
-        find_gaps(values["t_s"], values["applied_force_n"])
-        if "applied_force_n" in values
-        else None,
     )
+
+
+def _inputs_of(name: str, values: Mapping[str, Array]) -> dict[str, RecordedInput]:
+    """What drove the bench, by name."""
+    inputs: dict[str, RecordedInput] = {}
+    for quantity in (APPLIED_FORCE, APPLIED_TORQUE, MOTION):
+        for column, measured in values.items():
+            kind, _, own = column.partition(":")
+            if kind != quantity.column:
+                continue
+            own = own or quantity.key
+            if own in inputs:
+                raise RecordingError(f"{name}: header: input {own} has two columns, expected one")
+            acceleration = None
+            if quantity is MOTION:
+                acceleration = values.get(f"{ACCELERATION.column}:{own}")
+            gaps = find_gaps(values["t_s"], measured)
+            inputs[own] = RecordedInput(quantity, measured, acceleration, gaps)
+    for column in values:
+        kind, _, own = column.partition(":")
+        if kind == ACCELERATION.column and (
+            own not in inputs or inputs[own].quantity is not MOTION
+        ):
+            raise RecordingError(
+                f"{name}: header: column {column}: expected {MOTION.column}:{own} in addition"
+            )
+    return inputs
 
 
 def _stack_columns(cells: Sequence[Array | None], samples: int) -> Array | None:
@@ -73,7 +106,8 @@ def _column_of(
 
 
 def _struts_of(name: str, columns: Sequence[str], struts: Sequence[str] | None) -> list[str]:
-    named = [column.partition(":")[2] for column in columns if ":" in column]
+    parts = [column.partition(":") for column in columns]
+    named = [name for kind, _, name in parts if kind in _OF_A_STRUT and name]
     if struts is None:
         return list(dict.fromkeys(named)) or [""]
     for strut in named:
@@ -95,9 +129,11 @@ def _expected(kind: str) -> str:
         text = f"expected {quantities[quantity]} (in a mapping: unit: {unit})"
     else:
         columns = ", ".join(COLUMNS)
+        named = ", ".join(f"{column}:NAME" for column in _OF_AN_INPUT)
         return (
             f"expected one of {columns}, a height or strut force with its strut as in "
-            "height_m:tyre; `rig import` makes them of a foreign table"
+            f"height_m:tyre, or an input with its name ({named}); `rig import` makes them of a "
+            "foreign table"
         )
     return f"{text}; `rig import TABLE --mapping FILE` makes them of a foreign table"
 
@@ -108,8 +144,11 @@ def _check_header(name: str, columns: list[str]) -> list[str]:
         raise RecordingError(f"{name}: is empty, expected a header {','.join(COLUMNS[:3])}")
     kinds: list[str] = []
     for column in columns:
-        kind, colon, strut = column.partition(":")
-        if kind not in COLUMNS or (colon and (kind not in _OF_A_STRUT or not strut)):
+        kind, colon, own = column.partition(":")
+        may_name = kind in (*_OF_A_STRUT, *_OF_AN_INPUT)
+        has_to_name = kind in _OF_AN_INPUT and kind != APPLIED_FORCE.column
+        is_known = kind in COLUMNS or kind in _OF_AN_INPUT
+        if not is_known or (colon and not (may_name and own)) or (has_to_name and not own):
             raise RecordingError(f"{name}: header: column {column[:40]!r}: {_expected(kind)}")
         if columns.count(column) > 1:
             raise RecordingError(f"{name}: header: column {column} occurs twice, expected once")
@@ -117,9 +156,9 @@ def _check_header(name: str, columns: list[str]) -> list[str]:
     for column in COLUMNS[:2]:
         if column not in kinds:
             raise RecordingError(f"{name}: header: column {column} is missing, expected it")
-    if "applied_force_n" not in kinds and "strut_force_n" not in kinds:
+    if not {*_OF_AN_INPUT, "strut_force_n"} & set(kinds):
         raise RecordingError(
-            f"{name}: header: expected applied_force_n or strut_force_n, in addition to t_s and "
-            "height_m"
+            f"{name}: header: expected applied_force_n or strut_force_n (or an input of the model, "
+            "such as motion_m:road), in addition to t_s and height_m"
         )
     return columns

@@ -9,8 +9,13 @@ import pyarrow as pa
 import pyarrow.csv
 from numpy.typing import NDArray
 
-from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE, Quantity
-from rig.recordings.recording import Array, Recording, RecordingError
+from rig.channels.measured_quantities import (
+    ACCELERATION,
+    INPUT_QUANTITIES,
+    LOAD_CELL_FORCE,
+    TEMPERATURE,
+)
+from rig.recordings.recording import Array, RecordedInput, Recording, RecordingError
 
 _HEIGHT, _TIME = ".measured_height_m", ".measured_t_ns"
 _LONGEST_HEADER = 100_000
@@ -47,11 +52,12 @@ def read_export(path: Path, struts: Sequence[str] | None = None) -> Recording:
     sampled_ns = _column(path, table, names[0] + _TIME)
     is_new = np.isfinite(sampled_ns) & (np.diff(sampled_ns, prepend=np.nan) != 0.0)
     is_new &= np.all(np.isfinite(heights), axis=0)
-    applied, cell, temperature = (
-        _quantity(path, table, quantity, is_new)
-        for quantity in (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+    cell, temperature = (
+        _quantity(path, table, quantity.column, is_new)
+        for quantity in (LOAD_CELL_FORCE, TEMPERATURE)
     )
-    if applied is None and cell is None:
+    inputs = _inputs(path, table, is_new)
+    if not inputs and cell is None:
         raise RecordingError(
             f"{path.name}: holds heights alone, expected a run with an applied force or a load cell"
         )
@@ -59,7 +65,7 @@ def read_export(path: Path, struts: Sequence[str] | None = None) -> Recording:
         path.name,
         sampled_ns[is_new] * 1e-9,
         np.column_stack(heights)[is_new],
-        applied,
+        inputs,
         None if cell is None or len(names) > 1 else cell[:, np.newaxis],
         temperature,
     )
@@ -74,12 +80,27 @@ def _column(path: Path, table: pa.Table, name: str) -> Array:
         raise RecordingError(f"{path.name}: column {name}: expected numbers alone") from error
 
 
-def _quantity(
-    path: Path, table: pa.Table, quantity: Quantity, rows: NDArray[np.bool_]
-) -> Array | None:
+def _inputs(path: Path, table: pa.Table, rows: NDArray[np.bool_]) -> dict[str, RecordedInput]:
+    """What drove the bench at some ticks, by name."""
+    inputs: dict[str, RecordedInput] = {}
+    for column in table.column_names:
+        kind, _, name = column.partition(":")
+        quantity = next((item for item in INPUT_QUANTITIES if item.column == kind), None)
+        if quantity is None or quantity is ACCELERATION:
+            continue
+        values, acceleration = (
+            _quantity(path, table, other, rows)
+            for other in (column, f"{ACCELERATION.column}:{name}")
+        )
+        if values is not None:
+            inputs[name or quantity.key] = RecordedInput(quantity, values, acceleration)
+    return inputs
+
+
+def _quantity(path: Path, table: pa.Table, column: str, rows: NDArray[np.bool_]) -> Array | None:
     """A quantity of the bench at some ticks, straight between those at which it came, or None."""
-    if quantity.column not in table.column_names:
+    if column not in table.column_names:
         return None
-    values, ticks = _column(path, table, quantity.column), np.arange(table.num_rows)
+    values, ticks = _column(path, table, column), np.arange(table.num_rows)
     came = np.isfinite(values)
     return np.interp(ticks[rows], ticks[came], values[came]) if came.any() else None

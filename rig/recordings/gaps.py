@@ -1,6 +1,6 @@
 """Gaps and bursts of frames in a recording.
 
-Short gaps of the applied force are interpolated; at long ones a recording is divided.
+Short gaps of an input are interpolated; at long ones a recording is divided.
 
 Measured on a simulated bench of 31 kg (500 Hz, multisine up to 8 Hz, three nonlinear laws) with one
 gap a second: the error of the right model in free run is 1.00 times the noise floor with gaps over
@@ -8,6 +8,7 @@ which the force changes by 0.25 of its standard deviation (10 ms), 1.26 times wi
 times with 0.57 (24 ms) and 59 times with 80 ms.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ _ENOUGH_S = 3.0
 
 
 class Gaps(NamedTuple):
-    """Gaps of two samples or more in the applied force.
+    """Gaps of two samples or more in what drives a bench.
 
     Attributes:
         intervals_s: Begin and end of each.
@@ -57,7 +58,7 @@ class Gaps(NamedTuple):
         lengths_s = [end - begin for begin, end in self.intervals_s]
         number, long = len(lengths_s), len(self.long_s)
         text = (
-            f"{run}: the applied force is missing in {number} gap{'s' * (number > 1)} of two "
+            f"{run}: what drives the bench is missing in {number} gap{'s' * (number > 1)} of two "
             f"samples or more ({100.0 * sum(lengths_s) / self.duration_s:.2g} % of the run, up to "
             f"{max(lengths_s):.2g} s)"
         )
@@ -82,8 +83,17 @@ class Gaps(NamedTuple):
         }
 
 
-def find_gaps(t_s: Array, force_n: Array) -> Gaps | None:
-    """Gaps of a force between its samples, both of shape (n,), times increasing; None for none."""
+def combine_gaps(parts: Sequence[Gaps]) -> Gaps:
+    """Gaps of several inputs as those of one."""
+    return Gaps(
+        tuple(sorted({interval for part in parts for interval in part.intervals_s})),
+        min(part.longest_interpolated_s for part in parts),
+        max(part.duration_s for part in parts),
+    )
+
+
+def find_gaps(t_s: Array, values: Array) -> Gaps | None:
+    """Gaps of an input between its samples, both of shape (n,), times increasing; None for none."""
     steps_s = np.diff(t_s)
     if not len(steps_s) or not float(steps_s.sum()) > 0.0:
         return None
@@ -92,7 +102,7 @@ def find_gaps(t_s: Array, force_n: Array) -> Gaps | None:
     if not len(begins):
         return None
     intervals = tuple((float(t_s[k]), float(t_s[k + 1])) for k in begins)
-    longest_s = usual_s * _longest_lag(force_n)
+    longest_s = usual_s * _longest_lag(values)
     return Gaps(intervals, longest_s, float(t_s[-1] - t_s[0]))
 
 

@@ -4,9 +4,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dart_model.spec import ModelSpec
+from can_dbc.errors import expected_name
+from dart_model.spec import ForceInput, ModelSpec
+from rig.channels.measured_quantities import ACCELERATION, APPLIED_FORCE, quantity_of
 from rig.recordings.clipping import find_long_plateaus
-from rig.recordings.recording import Array, Recording, RecordingError
+from rig.recordings.recording import Array, RecordedInput, Recording, RecordingError
 
 _LEAST_SAMPLES = 200
 """The shortest recording, half a second, at 400 Hz."""
@@ -44,8 +46,7 @@ def check_recording(recording: Recording) -> Recording:
             )
         if advice and float(np.ptp(channel)) == 0.0:
             raise RecordingError(
-                f"{name}: {label} is constant at {channel[0]:.6g} N, expected it to change: "
-                f"{advice}"
+                f"{name}: {label} is constant at {channel[0]:.6g}, expected it to change: {advice}"
             )
         if label == "strut_force_n":
             _refuse_clipping(name, label, "N", channel)
@@ -65,6 +66,8 @@ def check_fits(recording: Recording, spec: ModelSpec) -> None:
             f"{recording.name}: {recording.heights_m.shape[1]} height(s), but model {spec.name} "
             f"has {struts} strut(s), expected one height for each: is it the model of this run?"
         )
+    if recording.inputs:
+        inputs_of(recording, spec)
     if recording.duration_s > _LONGEST_DURATION_S:
         raise RecordingError(
             f"{recording.name}: {recording.duration_s:.0f} s long, "
@@ -72,9 +75,43 @@ def check_fits(recording: Recording, spec: ModelSpec) -> None:
         )
 
 
+def inputs_of(recording: Recording, spec: ModelSpec) -> dict[str, RecordedInput]:
+    """What drove a recording, by the names of a model's inputs and in their order.
+
+    Raises:
+        RecordingError: They are not those of the model.
+    """
+    given, inputs = dict(recording.inputs), dict[str, RecordedInput]()
+    forces = [name for name, item in spec.drive.items() if isinstance(item, ForceInput)]
+    if APPLIED_FORCE.key in given and APPLIED_FORCE.key not in spec.drive and len(forces) == 1:
+        given[forces[0]] = given.pop(APPLIED_FORCE.key)
+    for name, item in spec.drive.items():
+        quantity = quantity_of(item)
+        if name not in given or given[name].quantity is not quantity:
+            column = quantity.column if spec.inputs is None else f"{quantity.column}:{name}"
+            raise RecordingError(
+                f"{recording.name}: expected a column {column}, because model {spec.name} has this "
+                "input"
+            )
+        inputs[name] = given.pop(name)
+    for name, other in given.items():
+        raise RecordingError(
+            f"{recording.name}: column {other.quantity.column}:{name}: model {spec.name} has no "
+            f"such input, {expected_name(name, list(spec.drive))}"
+        )
+    return inputs
+
+
 def _channels(recording: Recording) -> Iterable[tuple[str, Array, str]]:
-    if recording.applied_force_n is not None:
-        yield "applied_force_n", recording.applied_force_n, "apply a force that changes"
+    for name, item in recording.inputs.items():
+        label = item.quantity.column
+        if name != item.quantity.key:
+            label += f":{name}"
+        # One of several may rest.
+        advice = "drive the bench with it" if len(recording.inputs) == 1 else ""
+        yield label, item.values, advice
+        if item.acceleration_m_per_s2 is not None:
+            yield f"{ACCELERATION.column}:{name}", item.acceleration_m_per_s2, ""
     if recording.strut_forces_n is not None:
         for column in recording.strut_forces_n.T:
             if not np.all(np.isnan(column)):

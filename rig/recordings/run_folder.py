@@ -14,13 +14,14 @@ from can_dbc.protection import check_crc_log
 from can_dbc.units import Dimension
 from rig.bridge.incoming_messages import compile_follower_of
 from rig.channels.channel import Channel
-from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.checksums import refuse_damage
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_header
+from rig.plan.plan import Plan
 from rig.recordings.gaps import are_timed, find_gaps
-from rig.recordings.recording import Array, Recording, RecordingError
+from rig.recordings.recording import Array, RecordedInput, Recording, RecordingError
 
 _OFF_GRID = 0.4
 """Cycles by which an arrival may be off the grid of its cycle time."""
@@ -40,9 +41,7 @@ def read_run(folder: Path) -> Recording:
     run = read_run_folder(folder)
     refuse_damage(folder, run.damage)
     plan = plan_of_header(folder, run.header)
-    applied, cell, temperature = map(
-        plan.bench_channel, (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
-    )
+    cell, temperature = map(plan.bench_channel, (LOAD_CELL_FORCE, TEMPERATURE))
     payloads = _payloads(run, plan.channels)
     heights = [_samples(payloads, channel) for channel in plan.heights]
     for channel, (t_s, _) in zip(plan.heights, heights, strict=True):
@@ -53,10 +52,10 @@ def read_run(folder: Path) -> Recording:
             )
     t_s = heights[0][0]
     half_s = 0.5 * float(np.median(np.diff(t_s)))
-    applied_n, cell_n = (_resample(payloads, channel, t_s) for channel in (applied, cell))
-    if cell_n is None and applied_n is None:
+    inputs, cell_n = _inputs(payloads, plan, t_s), _resample(payloads, cell, t_s)
+    if cell_n is None and not inputs:
         raise RecordingError(
-            f"{folder}: has heights alone, expected signals.applied_force or "
+            f"{folder}: has heights alone, expected signals.applied_force, signals.inputs or "
             "signals.load_cell_force in its configuration, and frames of it"
         )
     # The bus carries one load cell; with several struts its strut is not known.
@@ -64,10 +63,9 @@ def read_run(folder: Path) -> Recording:
         folder.name,
         t_s,
         np.column_stack([_nearest(t_s, *height, half_s) for height in heights]),
-        applied_n,
+        inputs,
         None if cell_n is None or len(heights) > 1 else cell_n[:, np.newaxis],
         _resample(payloads, temperature, t_s),
-        None if applied is None else find_gaps(*_samples(payloads, applied)),
     )
 
 
@@ -158,6 +156,19 @@ def _grid_times_s(t_ns: NDArray[np.int64], cycle_ns: int | None) -> Array | None
     if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > _OFF_GRID * cycle_ns:
         return None
     return np.asarray((t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9, dtype=np.float64)
+
+
+def _inputs(payloads: _Payloads, plan: Plan, t_s: Array) -> dict[str, RecordedInput]:
+    """What drove the bench, at some times, by the names of the model's inputs."""
+    inputs: dict[str, RecordedInput] = {}
+    for item in plan.inputs:
+        channel = item.channel
+        values = _resample(payloads, channel, t_s)
+        if channel is not None and values is not None:
+            acceleration = _resample(payloads, item.acceleration, t_s)
+            gaps = find_gaps(*_samples(payloads, channel))
+            inputs[item.name] = RecordedInput(channel.quantity, values, acceleration, gaps)
+    return inputs
 
 
 def _resample(payloads: _Payloads, channel: Channel | None, t_s: Array) -> Array | None:

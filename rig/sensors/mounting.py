@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from can_dbc.addressing import Directory
 from can_dbc.errors import InputError, expected_name
-from rig.channels.channel import Channel, MeasuredSignal, Zero
+from rig.channels.channel import Channel, MeasuredSignal, Role, Zero
 from rig.files.yaml_edit import set_keys
 from rig.log.reader import RunFolder, read_run
 from rig.plan.plan import Plan
@@ -77,6 +77,10 @@ def entry_of(plan: Plan, channel: Channel) -> MeasuredSignal:
     if channel in plan.sensors:
         strut, _, sensor = channel.name.partition(".")
         return signals.further[strut][sensor]
+    name, _, further = channel.name.partition(".")
+    if channel.role is Role.INPUT and name in signals.inputs:
+        entry = signals.inputs[name]
+        return entry.acceleration or entry if further else entry
     return signals.bench[channel.quantity]
 
 
@@ -89,11 +93,14 @@ def as_read(plan: Plan) -> Plan:
         strut: {name: entry.model_copy(update=unmounted) for name, entry in group.items()}
         for strut, group in signals.further.items()
     }
+    inputs = {name: entry.model_copy(update=unmounted) for name, entry in signals.inputs.items()}
     bench = {
         quantity.key: entry.model_copy(update=unmounted)
         for quantity, entry in signals.bench.items()
     }
-    plain = signals.model_copy(update={"height": height, "further": further, **bench})
+    plain = signals.model_copy(
+        update={"height": height, "inputs": inputs, "further": further, **bench}
+    )
     supervision = plan.config.supervision.model_copy(update={"limits": ()})
     config = plan.config.model_copy(update={"signals": plain, "supervision": supervision})
     return plan.with_config(config)

@@ -9,7 +9,7 @@ margin and whose estimate settles in time.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import minimize
@@ -173,7 +173,7 @@ class _StrongerPlant:
         return getattr(self._plant, name)
 
     def load(
-        self, state: ModelState, virtual_forces_n: Sequence[float], *others: float
+        self, state: ModelState, virtual_forces_n: Sequence[float], *others: Any
     ) -> LoadedModel[ModelState]:
         return self._plant.load(state, [self._factor * f for f in virtual_forces_n], *others)
 

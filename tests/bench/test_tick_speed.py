@@ -234,12 +234,12 @@ def tick_subjects() -> dict[str, Subject]:
     """DART alone, and a tick with more and more of what belongs to it."""
     plant = DartPlant(load_model(MODELS / "reference.yaml"))
     state = plant.init([0.4])
-    loaded = plant.load(state, (0.0,), 10.0, 20.0)
+    loaded = plant.load(state, (0.0,), (10.0,), 20.0)
 
     def plant_ticks() -> None:
         for _ in range(TICKS):
-            plant.step(loaded, 1e-3, 11.0)
-            plant.load(state, (0.0,), 10.0, 20.0)
+            plant.step(loaded, 1e-3, (11.0,))
+            plant.load(state, (0.0,), (10.0,), 20.0)
 
     return {
         "DART, array functions": array_loop(observing=False),

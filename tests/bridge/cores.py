@@ -6,6 +6,7 @@ from dart_model.plant import DartPlant
 from dart_model.protocol import AnyPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
+from rig.bridge.measured_inputs import HeldInput
 from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -75,8 +76,14 @@ def channels(
         )
     for quantity in MEASURED:
         key = f"signals.{quantity.key}"
-        made.append(Channel(len(made), Role.BENCH, quantity, quantity.key, key, -1, MS))
+        role = Role.INPUT if quantity is APPLIED_FORCE else Role.BENCH
+        made.append(Channel(len(made), role, quantity, quantity.key, key, -1, MS))
     return [*made, *sensors]
+
+
+def applied_force(bench: Sequence[Channel]) -> list[HeldInput]:
+    """The inputs of a model that a single force drives."""
+    return [HeldInput(next((it for it in bench if it.role is Role.INPUT), None))]
 
 
 def supervised(
@@ -89,7 +96,12 @@ def supervised(
     """A supervised estimator of a model."""
     bench = channels(plant.struts) if bench is None else bench
     estimator = FreeModelEstimator(
-        plant, observers, bench, supervision.stale_after_ns, settling_times
+        plant,
+        observers,
+        bench,
+        applied_force(bench),
+        supervision.stale_after_ns,
+        settling_times,
     )
     return Supervisor(estimator, supervision, [supervision.limits] * plant.struts)
 

@@ -14,14 +14,17 @@ from rig.bridge.free_model import (
 from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
-from tests.bridge.cores import GAINS, MS, bench_sample, channels, settle_at_once
+from tests.bridge.cores import GAINS, MS, applied_force, bench_sample, channels, settle_at_once
 
 QUARTER_CAR = load_model(MODELS / "quarter_car.yaml")
 
 
 def estimator(struts=2):
     plant = DartPlant(QUARTER_CAR)
-    return FreeModelEstimator(plant, [GAINS] * struts, channels(struts), 10 * MS, settle_at_once)
+    bench = channels(struts)
+    return FreeModelEstimator(
+        plant, [GAINS] * struts, bench, applied_force(bench), 10 * MS, settle_at_once
+    )
 
 
 def at(t_ms, *samples):
@@ -87,8 +90,8 @@ def test_a_start_collects_the_newest_of_each_strut_and_of_the_bench():
     assert [[sample.value for sample in first] for first in state.first] == [
         [height + number for number in range(40 - needed, 40)] for height in (0.3, 0.4)
     ]
-    assert state.applied is not None
-    assert state.applied.value == 5.0
+    (applied,) = state.inputs
+    assert applied.value == 5.0
 
 
 def test_a_restart_keeps_what_the_observers_and_the_bench_are():
@@ -112,7 +115,7 @@ def test_a_restart_keeps_what_the_observers_and_the_bench_are():
     assert (again.t_ns, again.temperature_c) == (50 * MS, 35.0)
     assert again.first == ((), ())
     assert again.observers == state.observers
-    assert again.applied == state.applied
+    assert again.inputs == state.inputs
     assert not again.is_settled
     assert core.discard(state, again) == replace(state, t_ns=50 * MS)
 

@@ -163,7 +163,7 @@ def test_the_struts_of_a_message_are_those_of_its_reference_heights(protected):
     [
         ([height(0, 0)], True),
         ([CELL], True),
-        ([channel(0, Role.BENCH, APPLIED_FORCE, "FORCE")], True),
+        ([channel(0, Role.INPUT, APPLIED_FORCE, "FORCE")], True),
         ([RECORDED], False),
         ([OIL, RECORDED], False),
         ([OIL, CELL], True),

@@ -14,13 +14,8 @@ from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
 from rig.bridge.mode_supervisor import Supervision, Supervisor
-from rig.bridge.prescribed_motion import (
-    PrescribedMotionEstimator,
-    PrescribedMotionState,
-    TrackedMotion,
-    predict_motion,
-    update_motion,
-)
+from rig.bridge.prescribed_motion import PrescribedMotionEstimator, PrescribedMotionState
+from rig.bridge.tracked_motion import TrackedMotion, predict_motion, update_motion
 from rig.bridge.values import Mode, Request, StepInput
 from rig.channels.channel import Channel, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
@@ -478,7 +473,7 @@ def test_the_filters_gains_are_those_of_a_triple_pole(interval_ms: int) -> None:
     interval_s, pole = interval_ms * 1e-3, math.exp(-interval_ms / 2.0)
     rest = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
     after = update_motion(rest, Sample(0, 1.0, interval_ms * TICK_NS), 0.002)
-    assert after.height_m == pytest.approx(1.0 - pole**3)
+    assert after.position_m == pytest.approx(1.0 - pole**3)
     velocity = 1.5 * (1.0 - pole) ** 2 * (1.0 + pole) / interval_s
     assert after.velocity_m_per_s == pytest.approx(velocity)
     assert after.acceleration_m_per_s2 == pytest.approx((1.0 - pole) ** 3 / interval_s**2)

@@ -27,7 +27,7 @@ from rig.observers.pi import PiObserver
 from rig.plan.build import build_bridge, settling_times
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from tests.bridge.cores import GAINS, MS, gains
+from tests.bridge.cores import GAINS, MS, applied_force, gains
 from tests.faults.trial import SETTLING_MS
 from tests.observers.benches import REST_M, Truth
 
@@ -179,7 +179,7 @@ def supervisor(truth, observer):
     period_ns = truth.period_ns
     bench = (
         Channel(0, Role.HEIGHT, HEIGHT, "strut", "", 0, period_ns),
-        Channel(1, Role.BENCH, APPLIED_FORCE, "applied_force", "", -1, period_ns),
+        Channel(1, Role.INPUT, APPLIED_FORCE, "applied_force", "", -1, period_ns),
     )
     supervision = Supervision(
         stale_after_s=10 * period_ns * 1e-9, safe_after_s=200 * period_ns * 1e-9
@@ -190,7 +190,12 @@ def supervisor(truth, observer):
         return settling_times_ns(truth.plant, observers, [REST_M], timing)
 
     estimator = FreeModelEstimator(
-        truth.plant, (observer,), bench, supervision.stale_after_ns, settling_times
+        truth.plant,
+        (observer,),
+        bench,
+        applied_force(bench),
+        supervision.stale_after_ns,
+        settling_times,
     )
     return Supervisor(estimator, supervision, [()])
 

@@ -25,6 +25,7 @@ from tests.bridge.cores import (
     GAINS,
     MS,
     SUPERVISION,
+    applied_force,
     channels,
     core,
     gains,
@@ -435,6 +436,7 @@ def test_each_strut_has_one_observer():
             DartPlant(load_model(MODELS / "quarter_car.yaml")),
             (GAINS,),
             channels(2),
+            applied_force(channels(2)),
             10 * MS,
             settle_at_once,
         )

@@ -43,7 +43,7 @@ def test_a_law_s_force_is_in_the_strut(name):
     values = [parameters[item.name] for item in law.parameters]
     force = force_over_arrays(law)
     expected = force(1.5, height_m, velocity, 30.0, AMBIENT_C, memory, values, STRUT)
-    (force_n,) = plant.load(state, (0.0,), 30.0, AMBIENT_C).forces_n
+    (force_n,) = plant.load(state, (0.0,), (30.0,), AMBIENT_C).forces_n
     linear = -500.0 * (height_m - 0.5) - 100.0 * velocity
     assert force_n == pytest.approx(linear + expected, rel=1e-12, abs=1e-9)
 
@@ -52,25 +52,25 @@ def test_a_law_s_force_is_in_the_strut(name):
 def test_a_step_with_a_law_is_finite_and_repeatable(name):
     plant = with_effect(name)
     state = plant.init([0.45], [0.1])
-    loaded = plant.load(state, (2.0,), 10.0, AMBIENT_C)
-    after = plant.step(loaded, 1e-3, 12.0)
+    loaded = plant.load(state, (2.0,), (10.0,), AMBIENT_C)
+    after = plant.step(loaded, 1e-3, (12.0,))
     assert all(math.isfinite(value) for value in (*after.positions, *after.velocities))
     assert len(after.internal) == CATALOGUE[name].state_size
-    plant.step(plant.load(plant.init([0.2]), (-50.0,), -90.0, 60.0), 1e-3, 0.0)
-    assert plant.step(plant.load(state, (2.0,), 10.0, AMBIENT_C), 1e-3, 12.0) == after
+    plant.step(plant.load(plant.init([0.2]), (-50.0,), (-90.0,), 60.0), 1e-3, (0.0,))
+    assert plant.step(plant.load(state, (2.0,), (10.0,), AMBIENT_C), 1e-3, (12.0,)) == after
 
 
 def test_no_effect_changes_nothing():
     plain, none = DartPlant(SEED), with_effect("none")
     state = plain.init([0.4])
-    a = plain.step(plain.load(state, (3.0,), 10.0, AMBIENT_C), 1e-3, 12.0)
-    b = none.step(none.load(state, (3.0,), 10.0, AMBIENT_C), 1e-3, 12.0)
+    a = plain.step(plain.load(state, (3.0,), (10.0,), AMBIENT_C), 1e-3, (12.0,))
+    b = none.step(none.load(state, (3.0,), (10.0,), AMBIENT_C), 1e-3, (12.0,))
     assert a.positions == pytest.approx(b.positions, abs=1e-15)
 
 
 def accelerations(plant: DartPlant, heights: tuple[float, ...], applied_n: float) -> list[float]:
     without = (0.0,) * len(heights)
-    loaded = plant.load(plant.init(heights), without, applied_n, AMBIENT_C)
+    loaded = plant.load(plant.init(heights), without, (applied_n,), AMBIENT_C)
     return loaded.accelerations_m_per_s2
 
 
@@ -106,17 +106,17 @@ def test_memory_relaxes_as_the_maxwell_branch_does():
 
     def branch_n(state: PlantState) -> float:
         ((height_m, velocity_m_per_s),) = state.struts
-        (force_n,) = plant.load(state, (0.0,), 0.0, AMBIENT_C).forces_n
+        (force_n,) = plant.load(state, (0.0,), (0.0,), AMBIENT_C).forces_n
         return force_n + 500.0 * (height_m - 0.5) + 100.0 * velocity_m_per_s
 
     state = plant.init([0.5], [0.3])
     for _ in range(100):
-        state = plant.step(plant.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        state = plant.step(plant.load(state, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
     start_n = branch_n(state)
     assert start_n == pytest.approx(-1000.0 * 0.05 * 0.3 * (1.0 - math.exp(-0.1 / 0.05)), rel=1e-3)
     still = plant.state(state.positions, (0.0,), state.internal, state.t_s)
     for _ in range(50):
-        still = plant.step(plant.load(still, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        still = plant.step(plant.load(still, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
     assert branch_n(still) == pytest.approx(start_n * math.exp(-1.0), rel=1e-4)
 
 
@@ -126,7 +126,7 @@ def test_a_stiff_law_shortens_the_step():
     assert stiff.step_s < 0.4e-3
     state = stiff.init([0.5])
     for _ in range(200):
-        state = stiff.step(stiff.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        state = stiff.step(stiff.load(state, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
     # It swings about its rest position a micrometre below, and does not run away.
     assert state.positions[0] == pytest.approx(0.5, abs=3e-6)
 
@@ -138,7 +138,7 @@ def test_a_force_that_no_bench_reaches_does_not_shorten_the_step():
     state = rubber.init([0.5], [-3.0])  # thrown against it: 45 J
     lowest_m = 0.5
     for _ in range(1000):
-        state = rubber.step(rubber.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        state = rubber.step(rubber.load(state, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
         lowest_m = min(lowest_m, state.positions[0])
         assert math.isfinite(state.positions[0])
     assert 0.4 < lowest_m < 0.47

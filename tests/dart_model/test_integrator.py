@@ -24,11 +24,15 @@ def oscillator(omega, ratio):
     return slope
 
 
+def line(begin, end):
+    return lambda share: begin + share * (end - begin)
+
+
 def after(steps, internal=(), omega=7.0, ratio=0.1, duration_s=1.0, inputs=(0.0, 2.0)):
     slope = oscillator(omega, ratio)
     first = slope(0.3, -1.0, internal, 0.0, inputs[0])
     start = (0.3, -1.0, internal)
-    return advance(slope, moved, start, first, Course(0.0, duration_s, steps, inputs))
+    return advance(slope, moved, start, first, Course(0.0, duration_s, steps, line(*inputs)))
 
 
 @pytest.mark.parametrize("internal", [(), (0.2,)])
@@ -52,7 +56,7 @@ def test_steps_on_end_are_the_same_as_steps_of_two_calls(split):
             moved,
             (q, v, internal),
             first,
-            Course(begin / 40, steps / 40, steps, (1.0, 1.0)),
+            Course(begin / 40, steps / 40, steps, line(1.0, 1.0)),
         )
     assert (q, v) == pytest.approx(whole[:2], abs=1e-12)
 
@@ -62,7 +66,7 @@ def test_floats_and_arrays_are_computed_alike():
     slope = oscillator(7.0, 0.1)
     start = (np.array([0.3, 0.3]), np.array([-1.0, -1.0]), ())
     first = slope(*start, 0.0, 0.0)
-    q, v, _ = advance(slope, moved, start, first, Course(0.0, 1.0, 50, (0.0, 2.0)))
+    q, v, _ = advance(slope, moved, start, first, Course(0.0, 1.0, 50, line(0.0, 2.0)))
     assert q.tolist() == [scalar[0]] * 2
     assert v.tolist() == [scalar[1]] * 2
 
@@ -100,6 +104,6 @@ def test_at_that_step_the_free_response_is_off_by_less_than_a_thousandth(omega, 
     q, v = 1.0, 0.0
     for step in range(1, steps + 1):
         first = slope(q, v, (), 0.0, 0.0)
-        q, v, _ = advance(slope, moved, (q, v, ()), first, Course(0.0, h, 1, (0.0, 0.0)))
+        q, v, _ = advance(slope, moved, (q, v, ()), first, Course(0.0, h, 1, line(0.0, 0.0)))
         exact = (vectors[0] * weights * np.exp(values * step * h)).sum().real
         assert abs(q - exact) < 1e-3

@@ -83,8 +83,8 @@ def simulated(
     h = duration_s / steps
     without = (0.0,) * len(plant.spec.struts)
     for index in range(steps):
-        loaded = plant.load(state, without, applied(index * h), AMBIENT_C)
-        state = plant.step(loaded, h, applied((index + 1) * h))
+        loaded = plant.load(state, without, (applied(index * h),), AMBIENT_C)
+        state = plant.step(loaded, h, (applied((index + 1) * h),))
     return state
 
 
@@ -199,8 +199,8 @@ def test_default_step_stays_below_a_tenth_of_the_height_resolution_on_the_seed_c
                 # Both runs see the input as it is sampled at 1 kHz.
                 low, high = applied(tick * 1e-3), applied((tick + 1) * 1e-3)
                 rise = (high - low) / substeps
-                loaded = plant.load(state, (0.0,), low + part * rise, AMBIENT_C)
-                state = plant.step(loaded, step_s, low + (part + 1) * rise)
+                loaded = plant.load(state, (0.0,), (low + part * rise,), AMBIENT_C)
+                state = plant.step(loaded, step_s, (low + (part + 1) * rise,))
                 assert state.t_s == pytest.approx(t_s + step_s)
             found.append(state.positions[0])
         return np.array(found)
@@ -219,12 +219,12 @@ def test_nothing_is_remembered_between_calls(joint):
     virtual = (12.0,) * len(spec.struts)
 
     def answer() -> tuple[object, ...]:
-        loaded = plant.load(state, virtual, 5.0, AMBIENT_C)
-        after = plant.step(loaded, 1e-3, 6.0)
+        loaded = plant.load(state, virtual, (5.0,), AMBIENT_C)
+        after = plant.step(loaded, 1e-3, (6.0,))
         return after, loaded.forces_n, loaded.accelerations_m_per_s2
 
     first = answer()
-    plant.step(plant.load(other, virtual, -40.0, 80.0), 3e-3, 9.0)
+    plant.step(plant.load(other, virtual, (-40.0,), 80.0), 3e-3, (9.0,))
     plant.mechanics(np.full(count, 0.4), np.full(count, -2.0))
     assert answer() == first
 
@@ -242,8 +242,8 @@ def test_internal_forces_keep_the_momentum_of_free_bodies():
     before = momentum(state, [2.0, 5.0])
     world = plant._skeleton.dart
     for _ in range(300):
-        loaded = plant.load(state, (35.0,), 0.0, AMBIENT_C)
-        state = plant.step(loaded, 1e-3, 0.0)
+        loaded = plant.load(state, (35.0,), (0.0,), AMBIENT_C)
+        state = plant.step(loaded, 1e-3, (0.0,))
     world.setPositions(np.array(state.positions))
     world.setVelocities(np.array(state.velocities))
     after = sum(
@@ -279,7 +279,7 @@ def test_struts_take_away_no_degree_of_freedom():
     assert plant.coordinates == 12
     positions = (0.0,) * 9 + (0.3, 0.2, 0.5)
     state = plant.state(positions, (0.0,) * 12, (), 0.0)
-    accelerations = plant.load(state, (50.0,), 0.0, AMBIENT_C).acceleration
+    accelerations = plant.load(state, (50.0,), (0.0,), AMBIENT_C).acceleration
     assert np.count_nonzero(np.abs(accelerations) > 1e-9) == 12
 
 
@@ -288,7 +288,7 @@ def test_the_virtual_force_and_the_applied_force_push_as_the_signs_say():
     state = plant.init([0.29, 0.4])
 
     def accelerations(virtual: tuple[float, float], applied_n: float) -> np.ndarray:
-        loaded = plant.load(state, virtual, applied_n, AMBIENT_C)
+        loaded = plant.load(state, virtual, (applied_n,), AMBIENT_C)
         return np.array(loaded.accelerations_m_per_s2)
 
     free = accelerations((0.0, 0.0), 0.0)
@@ -335,7 +335,7 @@ struts:
         return
     gradient = float(end @ turned) / length
     state = plant.state((angle,), (rate,), (), 0.0)
-    loaded = plant.load(state, (7.0,), 0.0, AMBIENT_C)
+    loaded = plant.load(state, (7.0,), (0.0,), AMBIENT_C)
     ((height_m, velocity_m_per_s),) = state.struts
     assert height_m == pytest.approx(length, abs=1e-12)
     assert velocity_m_per_s == pytest.approx(gradient * rate, abs=1e-11)
@@ -358,9 +358,9 @@ def test_the_rate_of_a_strut_between_free_bodies_changes_as_its_acceleration_say
     plant = DartPlant(free_bodies(damping=7.0))
     positions, velocities = 0.5 * rng.standard_normal(12), rng.standard_normal(12)
     state = plant.state(positions.tolist(), velocities.tolist(), (), 0.0)
-    loaded = plant.load(state, (3.0,), 0.0, AMBIENT_C)
+    loaded = plant.load(state, (3.0,), (0.0,), AMBIENT_C)
     h = 1e-4
-    rates = [plant.step(loaded, dt_s, 0.0).struts[0][1] for dt_s in (h, -h)]
+    rates = [plant.step(loaded, dt_s, (0.0,)).struts[0][1] for dt_s in (h, -h)]
     slope = (rates[0] - rates[1]) / (2.0 * h)
     scale = max(1.0, abs(slope))
     assert loaded.accelerations_m_per_s2[0] == pytest.approx(slope, abs=1e-4 * scale)
@@ -388,12 +388,12 @@ def test_struts_between_the_same_bodies_add_up():
 def test_a_long_step_is_divided():
     plant = DartPlant(one_body())
     start = plant.init([0.45])
-    loaded = plant.load(start, (20.0,), 10.0, AMBIENT_C)
-    after = plant.step(loaded, 0.02, 30.0)
+    loaded = plant.load(start, (20.0,), (10.0,), AMBIENT_C)
+    after = plant.step(loaded, 0.02, (30.0,))
     state = start
     for index in range(20):
-        at = plant.load(state, (20.0,), 10.0 + index, AMBIENT_C)
-        state = plant.step(at, 1e-3, 11.0 + index)
+        at = plant.load(state, (20.0,), (10.0 + index,), AMBIENT_C)
+        state = plant.step(at, 1e-3, (11.0 + index,))
     assert after.positions == pytest.approx(state.positions, abs=1e-15)
     assert after.t_s == pytest.approx(0.02)
 
@@ -443,9 +443,9 @@ def test_mechanics_are_the_equations_of_motion():
         virtual, applied_n = rng.uniform(-50.0, 50.0, 2), float(rng.uniform(-50.0, 50.0))
         state = plant.init(heights, velocities)
         there = plant.mechanics(np.array(state.positions), np.array(state.velocities))
-        loaded = plant.load(state, virtual.tolist(), applied_n, AMBIENT_C)
+        loaded = plant.load(state, virtual.tolist(), (applied_n,), AMBIENT_C)
         forces = np.array(loaded.forces_n) + virtual
-        push = there.bias + there.struts.T @ forces + there.applied * applied_n
+        push = there.bias + there.struts.T @ forces + there.inputs @ [applied_n]
         expected = there.struts @ np.linalg.solve(there.mass, push)
         assert loaded.accelerations_m_per_s2 == pytest.approx(expected, abs=1e-10)
         assert there.heights_m == pytest.approx(heights)
@@ -459,7 +459,7 @@ def test_a_guide_need_not_be_vertical():
     text = ONE_BODY.format(mass=2.0, stiffness=100.0, damping=0.0, gravity=GRAVITY)
     text = text.replace("type: prismatic,", "type: prismatic, axis: [3, 0, 4],")
     plant = DartPlant(parse_model(text, "inclined.yaml"))
-    loaded = plant.load(plant.init([0.5]), (0.0,), 10.0, AMBIENT_C)
+    loaded = plant.load(plant.init([0.5]), (0.0,), (10.0,), AMBIENT_C)
     # Weight and the applied force act along z, of which the guide takes 4/5.
     assert loaded.accelerations_m_per_s2[0] == pytest.approx(0.8 * (10.0 / 2.0 - GRAVITY))
 
@@ -554,8 +554,8 @@ def test_a_linear_bench_is_right_to_a_thousandth_or_refused(masses, stiffnesses,
     ticks = min(200, max(20, round(duration_s / 1e-3)))
     state = plant.init(start.tolist())
     for tick in range(1, ticks + 1):
-        loaded = plant.load(state, (0.0, 0.0), 0.0, AMBIENT_C)
-        state = plant.step(loaded, duration_s / ticks, 0.0)
+        loaded = plant.load(state, (0.0, 0.0), (0.0,), AMBIENT_C)
+        state = plant.step(loaded, duration_s / ticks, (0.0,))
         if tick % (ticks // 10) == 0:
             exact = closed_form(mass, share * stiffness, stiffness, start, state.t_s)
             assert np.abs(np.array(state.positions) - exact).max() < 1e-3 * 0.02
@@ -570,7 +570,7 @@ def test_a_strut_of_five_million_newtons_a_metre_on_half_a_kilogram_is_stable_an
     assert plant.step_s == pytest.approx(0.1 / omega)
     state = plant.init([0.501])
     for _ in range(500):
-        state = plant.step(plant.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
+        state = plant.step(plant.load(state, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
         damped = omega * math.sqrt(1.0 - ratio**2)
         decay = math.exp(-ratio * omega * state.t_s)
         phase = damped * state.t_s

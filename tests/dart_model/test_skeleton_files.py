@@ -102,7 +102,7 @@ def test_a_file_gives_the_same_motion_as_the_inline_bodies(name, tmp_path):
     for plant in plants:
         state = plant.init([0.42])
         for _ in range(50):
-            state = plant.step(plant.load(state, (20.0,), 30.0, 20.0), 1e-3, 30.0)
+            state = plant.step(plant.load(state, (20.0,), (30.0,), 20.0), 1e-3, (30.0,))
         after.append(state.struts)
     assert after[0][0] == pytest.approx(after[1][0], abs=1e-12)
 
@@ -125,8 +125,8 @@ def test_a_spring_or_damper_of_the_joint_itself_acts(name, text, own_force_n, tm
     for skeleton in (f"{{file: {name}}}", INLINE):
         plant = DartPlant(model(tmp_path, skeleton))
         moving = plant.init([0.42], [0.7])
-        plant.load(plant.init([0.1]), (0.0,), 0.0, 20.0)
-        found.append(plant.load(moving, (0.0,), 0.0, 20.0).accelerations_m_per_s2[0])
+        plant.load(plant.init([0.1]), (0.0,), (0.0,), 20.0)
+        found.append(plant.load(moving, (0.0,), (0.0,), 20.0).accelerations_m_per_s2[0])
     assert found[0] == pytest.approx(found[1] + own_force_n / 10.0, rel=1e-6)
 
 

@@ -185,7 +185,7 @@ def refused(text: str) -> str:
         ),
         ("prismatic", "sliding", "joint.type: 'sliding': expected one of prismatic, revolute"),
         ("[0, 0, 1]", "[0, 0]", "joint.axis: 2 item(s), expected more"),
-        ("[0, 0, 1]", "[0, 0, 0]", "joint: axis [0.0, 0.0, 0.0]: expected a direction"),
+        ("[0, 0, 1]", "[0, 0, 0]", "joint.axis: [0.0, 0.0, 0.0]: expected a direction"),
         ("parent: world", "parent: wall", "joint.parent 'wall': expected world"),
         ("{name: body,", "{name: world,", "body 'world': expected another name"),
         ("[world, body]", "[world, world]", "struts.0: between ['world', 'world']: expected two"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from dart_model.spec import parse_model
 from rig.recordings.recording import Recording
+from tests.diagnosis.driven import driven_by
 from tests.diagnosis.integrator import integrated, measured
 
 MASS, STIFFNESS, DAMPING, FREE, GRAVITY = 12.0, 2500.0, 70.0, 0.4, 9.81
@@ -95,4 +96,4 @@ def run(effect, seed=1, noise_m=1e-5, load=load_n, name=None, **kwargs):
     t_s, true_m = heights(effect, load=load, **kwargs)
     noisy_m = measured(true_m, noise_m, 2e-6, seed)
     applied_n = np.array([load(t) for t in t_s.tolist()])
-    return Recording(name or f"run{seed}", t_s, noisy_m[:, np.newaxis], applied_n, None, None)
+    return Recording(name or f"run{seed}", t_s, noisy_m[:, np.newaxis], driven_by(applied_n))

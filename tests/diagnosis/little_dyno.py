@@ -133,7 +133,7 @@ def run(
         name or f"dyno{seed}",
         times,
         noisy_m[:, np.newaxis],
-        None,
+        {},
         noisy_n[:, np.newaxis],
         np.array([warm(t) for t in times.tolist()]) if warm else None,
     )

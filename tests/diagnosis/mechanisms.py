@@ -6,6 +6,7 @@ import numpy as np
 
 from dart_model.spec import load_model
 from rig.recordings.recording import Recording
+from tests.diagnosis.driven import driven_by
 from tests.diagnosis.integrator import integrated, measured
 
 GRAVITY = 9.81
@@ -27,7 +28,7 @@ def lines_n(scale, frequencies_hz, shift=0.0):
 def recording(name, t_s, heights_m, load_n, seed):
     """Heights noisy by 10 µm and rounded to 2 µm."""
     applied_n = np.array([load_n(t) for t in t_s.tolist()])
-    return Recording(name, t_s, measured(heights_m, 1e-5, 2e-6, seed), applied_n, None, None)
+    return Recording(name, t_s, measured(heights_m, 1e-5, 2e-6, seed), driven_by(applied_n))
 
 
 class TrailingArm:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tests.diagnosis.driven import driven_by
+
 _SUPERSCRIPTS = str.maketrans("²³", "23")
 _BASE = {
     "": (0, 0, 0),
@@ -47,7 +49,7 @@ class Scale:
             record,
             t_s=record.t_s * self.time,
             heights_m=record.heights_m * self.length,
-            applied_force_n=None if applied is None else applied * self.force,
+            inputs={} if applied is None else driven_by(applied * self.force),
             strut_forces_n=None if forces is None else forces * self.force,
         )
 
@@ -78,7 +80,7 @@ def mirrored(record, about_m):
     return replace(
         record,
         heights_m=2.0 * about_m - record.heights_m,
-        applied_force_n=None if applied is None else -applied,
+        inputs={} if applied is None else driven_by(-applied),
         strut_forces_n=None if forces is None else -forces,
     )
 
@@ -90,9 +92,11 @@ def cut(record):
     def part(name, rows):
         arrays = {
             key: None if getattr(record, key) is None else getattr(record, key)[rows]
-            for key in ("t_s", "heights_m", "applied_force_n", "strut_forces_n", "temperature_c")
+            for key in ("t_s", "heights_m", "strut_forces_n", "temperature_c")
         }
-        return replace(record, name=name, **arrays)
+        applied = record.applied_force_n
+        inputs = {} if applied is None else driven_by(applied[rows])
+        return replace(record, name=name, inputs=inputs, **arrays)
 
     return part(f"{record.name}a", slice(0, half)), part(f"{record.name}b", slice(half, None))
 

@@ -37,8 +37,8 @@ def dart_heights(model, t_s, load_n, start_m, step_s=1e-3):
         count = max(1, round((after - before) / step_s))
         times = np.linspace(before, after, count + 1).tolist()
         for now, then in pairwise(times):
-            loaded = plant.load(state, (0.0,) * len(start_m), load_n(now), 20.0)
-            state = plant.step(loaded, then - now, load_n(then))
+            loaded = plant.load(state, (0.0,) * len(start_m), (load_n(now),), 20.0)
+            state = plant.step(loaded, then - now, (load_n(then),))
         rows.append([height for height, _ in state.struts])
     return np.array(rows)
 
@@ -129,7 +129,7 @@ def test_the_little_dyno():
     for t, (force_n,) in zip(record.t_s.tolist(), record.strut_forces_n.tolist(), strict=True):
         z, v = dyno.broad(t)
         state = plant.init([z], [v])
-        (dart_n,) = plant.load(state, (0.0,), 0.0, 20.0).forces_n
+        (dart_n,) = plant.load(state, (0.0,), (0.0,), 20.0).forces_n
         assert dart_n == pytest.approx(force_n, abs=0.051)
 
 

@@ -20,6 +20,7 @@ from rig.recordings.gaps import are_timed, find_gaps
 from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_bench, little_dyno
+from tests.diagnosis.driven import driven_by
 
 HEAVY = 1.1 * little_bench.MASS
 FORCE_NOISE_N = 1.0
@@ -88,13 +89,13 @@ def test_gaps_of_the_applied_force_are_reported(tmp_path):
     arguments = [str(tmp_path / "whole.csv"), str(tmp_path / "gap.csv")]
     arguments += ["--model", str(tmp_path / "right.yaml")]
     printed = CliRunner().invoke(app, ["evaluate", *arguments]).output
-    assert "gap.csv: the applied force is missing in 1 gap" in printed
+    assert "gap.csv: what drives the bench is missing in 1 gap" in " ".join(printed.split())
     assert "up to 0.1 s). In 1 of them it changes too much" in " ".join(printed.split())
-    assert "whole.csv: the applied force" not in printed
+    assert "whole.csv: what drives" not in printed
     runs = [read_recording(Path(path)) for path in arguments[:2]]
     notes = diagnose(little_bench.model(), runs[:1], runs[1:]).diagnosis.notes
-    assert runs[1].force_gaps is not None
-    assert runs[1].force_gaps.report("gap.csv") in notes
+    assert runs[1].gaps is not None
+    assert runs[1].gaps.report("gap.csv") in notes
 
 
 @given(st.lists(st.integers(1, 6), min_size=20, max_size=60))
@@ -130,8 +131,7 @@ def with_gap(run, *gaps_s):
         run,
         t_s=run.t_s[kept],
         heights_m=run.heights_m[kept],
-        applied_force_n=force_n,
-        force_gaps=find_gaps(run.t_s[kept], force_n),
+        inputs=driven_by(force_n, find_gaps(run.t_s[kept], force_n)),
     )
 
 

@@ -11,6 +11,7 @@ from rig.diagnosis.diagnose import diagnose
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import is_at_the_floor, missing
+from tests.diagnosis.driven import driven_by
 
 
 class Friction(bench.Nothing):
@@ -33,7 +34,7 @@ class Knock(bench.Nothing):
 def with_force_noise(record, seed, noise_n):
     rng = np.random.default_rng(seed)
     noise = rng.normal(0.0, noise_n, len(record.t_s))
-    return replace(record, applied_force_n=record.applied_force_n + noise)
+    return replace(record, inputs=driven_by(record.applied_force_n + noise))
 
 
 def test_noise_of_the_recorded_force_is_no_effect():

@@ -11,6 +11,7 @@ from rig.diagnosis.diagnose import diagnose
 from rig.recordings.recording import Recording
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.answers import LINEAR_FAMILIES, correction, holds, is_at_the_floor, named
+from tests.diagnosis.driven import driven_by
 from tests.diagnosis.little_bench import DAMPING, FREE, MASS, STIFFNESS, Nothing
 
 
@@ -337,7 +338,10 @@ def test_missing_samples_and_uneven_times_change_nothing():
     rng = np.random.default_rng(5)
     keep = np.sort(rng.choice(len(record.t_s), int(0.85 * len(record.t_s)), replace=False))
     thinned = Recording(
-        "gaps", record.t_s[keep], record.heights_m[keep], record.applied_force_n[keep], None, None
+        "gaps",
+        record.t_s[keep],
+        record.heights_m[keep],
+        driven_by(record.applied_force_n[keep]),
     )
     found = diagnose(bench.model(), [thinned], [record]).diagnosis
     assert [e.family for e in found.effects] == ["stiffness"]

@@ -49,11 +49,11 @@ def test_every_kind_has_a_bench_and_a_catalogue_of_laws():
     benches = [kind.bench for kind in kinds()]
     assert len(set(benches)) == len(benches)
     assert all(any(bench in law.benches for law in CATALOGUE.values()) for bench in benches)
-    assert all(kind.assumption.endswith(".") for kind in kinds())
 
 
 def test_recordings_have_grids_blocks_and_residuals_of_one_length(problems, fits):
     problem, model = problems.learnt, fits[0].model
+    assert all(note.endswith(".") for note in problem.assumptions)
     assert problem.recordings == len(problem.grids) == len(model.parts.starts) == 2
     for k, grid in enumerate(problem.grids):
         residual, blocks = problem.residual(k, model), problem.blocks(k)

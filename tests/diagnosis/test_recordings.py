@@ -21,6 +21,7 @@ from rig.recordings.recording import Recording, RecordingError
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import is_at_the_floor
+from tests.diagnosis.driven import driven_by
 from tests.diagnosis.little_dyno import Nothing
 from tests.diagnosis.test_prescribed import Friction, Stiffness, Yielding
 
@@ -48,7 +49,7 @@ def refused(record: Recording, *held_out: Recording, model=None) -> str:
 
 
 def test_recordings_of_both_kinds_are_refused(record: Recording) -> None:
-    driven = replace(record, name="driven", applied_force_n=np.sin(9.0 * record.t_s))
+    driven = replace(record, name="driven", inputs=driven_by(np.sin(9.0 * record.t_s)))
     assert "one kind" in refused(record, driven)
 
 
@@ -180,10 +181,12 @@ TABLES = {
     "no height": (without("height_m"), None, "height_m"),
     "no force": (without("applied_force_n"), None, "applied_force_n"),
     "an unknown column": (renamed("height_m", "height_mm"), None, "height_mm"),
-    "an applied force of a strut": (
-        renamed("applied_force_n", "applied_force_n:tyre"),
+    "a motion without a name": (renamed("applied_force_n", "motion_m"), None, "motion_m"),
+    "an input without a name": (renamed("applied_force_n", "applied_force_n:"), None, "force_n:"),
+    "an acceleration alone": (
+        renamed("applied_force_n", "acceleration_m_per_s2:road"),
         None,
-        "applied_force_n:tyre",
+        "motion_m:road",
     ),
     "a strut without a name": (renamed("height_m", "height_m:"), None, "height_m:"),
     "an unknown strut": (renamed("height_m", "height_m:tire"), ["tyre"], "'tire'"),
@@ -290,7 +293,7 @@ def test_missing_heights_and_uneven_times_change_little() -> None:
     keep = np.sort(rng.choice(len(whole.t_s), int(0.85 * len(whole.t_s)), replace=False))
     heights = whole.heights_m[keep].copy()
     heights[rng.random(len(keep)) < 0.05] = np.nan
-    gaps = Recording("gaps", whole.t_s[keep], heights, None, whole.strut_forces_n[keep], None)
+    gaps = Recording("gaps", whole.t_s[keep], heights, {}, whole.strut_forces_n[keep])
     found = diagnose(dyno.model(), [gaps], [whole]).diagnosis
     assert [effect.name for effect in found.effects] == ["linear_stiffness"]
     estimate = found.effects[0].parameters["stiffness_n_per_m"]
@@ -340,9 +343,7 @@ def measured(name: str, folder: Path) -> Recording:
     mapping = load_mapping(CONFIGS / "dyno_mapping.yaml")
     report = import_table(MR_DAMPER / f"{name}.txt", mapping, folder / f"{name}.csv")
     t_s, height_m, force_n = np.loadtxt(report.out, delimiter=",", skiprows=1).T
-    return Recording(
-        name, t_s - t_s[0], height_m[:, np.newaxis], None, force_n[:, np.newaxis], None
-    )
+    return Recording(name, t_s - t_s[0], height_m[:, np.newaxis], {}, force_n[:, np.newaxis])
 
 
 @pytest.mark.long

@@ -33,7 +33,7 @@ def let_go(spec, step_s):
     heights = [DISPLACED_M]
     every = round(STEP_S / step_s)
     for k in range(round(DURATION_S / step_s)):
-        state = plant.step(plant.load(state, (0.0,), 0.0, 20.0), step_s, 0.0)
+        state = plant.step(plant.load(state, (0.0,), (0.0,), 20.0), step_s, (0.0,))
         if (k + 1) % every == 0:
             heights.append(state.struts[0][0])
     return np.array(heights)
@@ -121,9 +121,9 @@ def test_a_strut_of_a_quarter_car_gives_its_force(tmp_path, version):
     t_s = np.arange(1000) * 1e-3
     rows = []
     for at_s in t_s:
-        loaded = plant.load(state, (0.0, 0.0), 40.0 * np.sin(9.0 * at_s), 20.0)
+        loaded = plant.load(state, (0.0, 0.0), (40.0 * np.sin(9.0 * at_s),), 20.0)
         rows.append((*state.struts[1], loaded.forces_n[1]))
-        state = plant.step(loaded, 1e-3, 40.0 * np.sin(9.0 * (at_s + 1e-3)))
+        state = plant.step(loaded, 1e-3, (40.0 * np.sin(9.0 * (at_s + 1e-3)),))
     height, speed, force = np.array(rows).T
     path = written(tmp_path, strut_component(spec, spec.strut("suspension")), version, spec)
     assert validate_fmu(str(path)) == []
@@ -164,7 +164,7 @@ def test_an_applied_force_that_rises_and_falls(tmp_path):
     state = plant.init([float("nan")])
     theirs = [state.struts[0][0]]
     for k in range(len(t_s) - 1):
-        state = plant.step(plant.load(state, (0.0,), force[k], 20.0), 1e-3, force[k + 1])
+        state = plant.step(plant.load(state, (0.0,), (force[k],), 20.0), 1e-3, (force[k + 1],))
         theirs.append(state.struts[0][0])
     for version, reach in (("2.0", 1e-10), ("3.0", 2e-5)):
         path = written(tmp_path, bench_component(spec), version, spec)

@@ -149,8 +149,8 @@ def moved(plant):
     state = plant.init([0.38])
     rows = []
     for k in range(400):
-        loaded = plant.load(state, (5.0,), 30.0 * np.sin(0.02 * k), 20.0)
-        state = plant.step(loaded, 1e-3, 30.0 * np.sin(0.02 * (k + 1)))
+        loaded = plant.load(state, (5.0,), (30.0 * np.sin(0.02 * k),), 20.0)
+        state = plant.step(loaded, 1e-3, (30.0 * np.sin(0.02 * (k + 1)),))
         rows.append((*state.struts[0], loaded.forces_n[0]))
     return np.array(rows)
 
@@ -161,8 +161,8 @@ def test_the_past_can_be_computed_again(tmp_path):
     plant = DartPlant(imported(tmp_path, bench_component(spec), spec, "2.0"))
     states = [plant.init([0.38])]
     for _ in range(200):
-        states.append(plant.step(plant.load(states[-1], (0.0,), 0.0, 20.0), 1e-3, 0.0))
-    again = plant.step(plant.load(states[50], (0.0,), 0.0, 20.0), 1e-3, 0.0)
+        states.append(plant.step(plant.load(states[-1], (0.0,), (0.0,), 20.0), 1e-3, (0.0,)))
+    again = plant.step(plant.load(states[50], (0.0,), (0.0,), 20.0), 1e-3, (0.0,))
     assert again == states[51]
     numbers = plant.numbers(states[120])
     assert plant.state_of(numbers, states[120].t_s) == states[120]
@@ -332,7 +332,7 @@ def test_a_virtual_force_accelerates_the_right_mass(tmp_path):
     for plant in (ours, theirs):
         state = plant.init([0.3])
         for _ in range(200):
-            state = plant.step(plant.load(state, (20.0,), 3.0, 20.0), 1e-3, 3.0)
+            state = plant.step(plant.load(state, (20.0,), (3.0,), 20.0), 1e-3, (3.0,))
         rows.append(state.struts[0])
     assert rows[0] == pytest.approx(rows[1], rel=1e-9)
 

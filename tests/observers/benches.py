@@ -84,7 +84,7 @@ def follow(truth, heights_m, observer):
     supervision = Supervision(stale_after_s=stale_s, safe_after_s=10 * stale_s)
     bench = (
         Channel(0, Role.HEIGHT, HEIGHT, STRUT, "", 0, period_ns),
-        Channel(1, Role.BENCH, APPLIED_FORCE, "applied_force", "", -1, period_ns),
+        Channel(1, Role.INPUT, APPLIED_FORCE, "applied_force", "", -1, period_ns),
     )
     core = supervised(truth.plant, (observer,), supervision, bench)
     state, columns, rows = core.init(0), LogColumns([STRUT], bench), []

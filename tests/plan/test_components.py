@@ -33,19 +33,20 @@ class Loaded(Struct, frozen=True):
     virtual_n: float
     forces_n: list[float]
     accelerations_m_per_s2: list[float]
-    applied_force_n: float
+    inputs: tuple[float, ...]
     temperature_c: float
 
 class ToyPlant:
     """Semi-implicit Euler in tenths of a step: enough to be followed by an observer."""
     struts = 1
+    inputs = 1
     is_constant = True
 
     def __init__(self, spec):
         (self.strut,), (body,) = spec.struts, spec.skeleton.bodies
         self.mass_kg, self.gravity = body.mass_kg, spec.gravity_m_per_s2
 
-    def init(self, heights_m, velocities_m_per_s=None, t_s=0.0):
+    def init(self, heights_m, velocities_m_per_s=None, t_s=0.0, inputs=None):
         return State(heights_m[0], (velocities_m_per_s or [0.0])[0])
 
     def force_n(self, state):
@@ -53,17 +54,17 @@ class ToyPlant:
         return s.stiffness_n_per_m * (s.free_length_m - state.height_m) - (
             s.damping_n_s_per_m * state.velocity_m_per_s)
 
-    def load(self, state, virtual_forces_n, applied_force_n, temperature_c):
+    def load(self, state, virtual_forces_n, inputs, temperature_c):
         force_n = self.force_n(state)
-        a = (force_n + virtual_forces_n[0] + applied_force_n) / self.mass_kg - self.gravity
-        return Loaded(state, virtual_forces_n[0], [force_n], [a], applied_force_n, temperature_c)
+        a = (force_n + virtual_forces_n[0] + inputs[0]) / self.mass_kg - self.gravity
+        return Loaded(state, virtual_forces_n[0], [force_n], [a], inputs, temperature_c)
 
-    def step(self, loaded, dt_s, applied_force_end_n):
+    def step(self, loaded, dt_s, inputs_end):
         state, h = loaded.state, dt_s / 10
         for k in range(10):
-            applied = loaded.applied_force_n + (k + 0.5) / 10 * (
-                applied_force_end_n - loaded.applied_force_n)
-            at = self.load(state, [loaded.virtual_n], applied, 20.0)
+            (begin_n,), (end_n,) = loaded.inputs, inputs_end
+            applied_n = begin_n + (k + 0.5) / 10 * (end_n - begin_n)
+            at = self.load(state, [loaded.virtual_n], (applied_n,), 20.0)
             v = state.velocity_m_per_s + h * at.accelerations_m_per_s2[0]
             state = State(state.height_m + h * v, v)
         return state

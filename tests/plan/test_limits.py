@@ -163,7 +163,7 @@ def test_the_estimate_of_a_strut_is_judged_by_its_own_limits():
 
 FORCE = Channel(
     1,
-    Role.BENCH,
+    Role.INPUT,
     APPLIED_FORCE,
     "applied_force",
     "",

@@ -27,7 +27,15 @@ from rig.observers import OBSERVERS
 from rig.observers.protocol import Innovation, SensorStep, Start, TuningTask
 from rig.observers.strut_sensors import STRUT_SENSORS, Instant
 from rig.plan.build import ENGINES
-from tests.bridge.cores import FIRST, GAINS, MEASURED, MS, bench_sample, channels
+from tests.bridge.cores import (
+    FIRST,
+    GAINS,
+    MEASURED,
+    MS,
+    applied_force,
+    bench_sample,
+    channels,
+)
 
 START = Start(0, 0.1, MS, 0, 50.0, 10.0)
 EXAMPLES = {
@@ -90,7 +98,8 @@ def estimators():
     spec = load_model(MODELS / "reference.yaml")
     bench = channels(1)
     settling_times = partial(map, lambda _: SETTLING_TICKS * MS)
-    yield FreeModelEstimator(DartPlant(spec), (GAINS,), bench, 10 * MS, settling_times)
+    inputs = applied_force(bench)
+    yield FreeModelEstimator(DartPlant(spec), (GAINS,), bench, inputs, 10 * MS, settling_times)
     yield PrescribedMotionEstimator(PrescribedStrut(spec), 0.002, bench, 10 * MS)
 
 
@@ -149,14 +158,14 @@ def test_an_estimator_has_settled_after_some_time_and_again_after_a_change(estim
 def test_a_plant_answers_by_its_arguments_alone(engine):
     plant = ENGINES[engine](load_model(MODELS / "quarter_car.yaml"))
     state = plant.init((0.29, 0.4), (0.1, -0.1))
-    loaded = plant.load(state, (1.0, 2.0), 30.0, 20.0)
-    first = plant.step(loaded, 1e-3, 31.0)
-    plant.step(plant.load(plant.init((0.2, 0.3)), (0.0, 9.0), 0.0, 60.0), 5e-3, 0.0)
-    assert plant.step(loaded, 1e-3, 31.0).struts == first.struts
+    loaded = plant.load(state, (1.0, 2.0), (30.0,), 20.0)
+    first = plant.step(loaded, 1e-3, (31.0,))
+    plant.step(plant.load(plant.init((0.2, 0.3)), (0.0, 9.0), (0.0,), 60.0), 5e-3, (0.0,))
+    assert plant.step(loaded, 1e-3, (31.0,)).struts == first.struts
     again = plant.state_of(plant.numbers(state))
     assert np.allclose(again.struts, state.struts, rtol=0.0, atol=1e-12)
     assert len(loaded.forces_n) == len(loaded.accelerations_m_per_s2) == plant.struts == 2
-    assert (loaded.applied_force_n, loaded.temperature_c) == (30.0, 20.0)
+    assert (loaded.inputs, loaded.temperature_c) == ((30.0,), 20.0)
     assert isinstance(plant.is_constant, bool)
 
 

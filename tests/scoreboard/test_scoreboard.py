@@ -13,6 +13,7 @@ from rig.formats.mapping import load_mapping
 from rig.plan.config import CONFIGS
 from rig.recordings.recording import Recording
 from tests.diagnosis import little_dyno as dyno
+from tests.diagnosis.driven import driven_by
 from tests.scoreboard import silverbox
 from tests.scoreboard.run import run_scoreboard
 from tests.scoreboard.silverbox import PUBLISHED, TESTS, TRAINING, open_loop_rmse_m
@@ -34,7 +35,7 @@ def driven_record(samples: int = 4000, rate_hz: float = 600.0) -> Recording:
     turn = np.exp(1j * np.outer(t_s, omega))
     noise_m = 1e-6 * rng.standard_normal(samples)
     height_m = LENGTH_M + (turn @ response).real + noise_m
-    return Recording("linear", t_s, height_m[:, np.newaxis], (turn @ force).real)
+    return Recording("linear", t_s, height_m[:, np.newaxis], driven_by((turn @ force).real))
 
 
 def test_the_rough_start_of_a_driven_bench_has_its_stiffness_and_the_stated_resonance() -> None:
@@ -69,7 +70,7 @@ def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
     rate = 0.12 * np.cos(12.0 * t_s) + 0.124 * np.cos(31.0 * t_s)
     force_n = -4000.0 * (height_m - 0.31) - 700.0 * rate
     spec = dyno_start(
-        [Recording("dyno", t_s, height_m[:, np.newaxis], None, force_n[:, np.newaxis])], "dyno"
+        [Recording("dyno", t_s, height_m[:, np.newaxis], {}, force_n[:, np.newaxis])], "dyno"
     )
     (strut,) = spec.struts
     assert strut.stiffness_n_per_m == pytest.approx(4000.0, rel=1e-2)

@@ -228,12 +228,13 @@ class Equations(NamedTuple):
 
     Attributes:
         mass_inverse: Inverse mass matrix, shape (K, n, n).
-        bias: Generalised force of all but struts and applied force, shape (K, n).
+        bias: Generalised force of all but struts and inputs, shape (K, n).
         bias_q: Its derivative by the coordinates, shape (K, n, n).
         bias_v: Its derivative by their rates, shape (K, n, n).
         jacobian: Jacobian of the struts, shape (K, struts, n).
         heights_m: Strut heights, shape (K, struts).
-        applied: Generalised force per newton of applied force, shape (K, n).
+        rates_m_per_s: Their rates, shape (K, struts).
+        inputs: Generalised force per unit of each input, shape (K, n, inputs).
         q: Coordinates to which these belong, shape (K, n).
         v: Their rates, shape (K, n).
     """
@@ -244,7 +245,8 @@ class Equations(NamedTuple):
     bias_v: Array
     jacobian: Array
     heights_m: Array
-    applied: Array
+    rates_m_per_s: Array
+    inputs: Array
     q: Array
     v: Array
 
@@ -255,14 +257,19 @@ class Scenario(NamedTuple):
     Attributes:
         start: Coordinates, their rates and internal states, shape (2 n + states,).
         t_s: Times of the nodes, shape (N,).
-        applied_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
+        applied_n: Applied force of laws at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
         temperature_c: Temperature at the nodes, shape (N,).
+        inputs: Input vector at half sub-steps, shape (as above, inputs).
+        moved: What moved bodies add to heights and to their rates at half sub-steps, shape (as
+            above, 2, struts); empty where no body is moved.
     """
 
     start: Array
     t_s: Array
     applied_n: Array
     temperature_c: Array
+    inputs: Array
+    moved: Array
 
 
 class Steps(NamedTuple):
@@ -300,7 +307,8 @@ class _Span(NamedTuple):
 
     Attributes:
         before: Index of the node before in the equations' tables.
-        applied_n: Applied force at the beginning, the middle and the end of the step.
+        fine: Indices of the beginning, the middle and the end of the step in the scenario's.
+        applied_n: Applied force there.
         warming_k: Change of the temperature from node to node.
     """
 
@@ -311,6 +319,7 @@ class _Span(NamedTuple):
     step_s: float
     step: int
     steps: int
+    fine: tuple[int, int, int]
     applied_n: tuple[float, float, float]
     temperature_c: float
     warming_k: float
@@ -319,6 +328,7 @@ class _Span(NamedTuple):
 class _Work(NamedTuple):
     """What an evaluation of the slope at `x` (2 n + states,) leaves behind, `general` in (n,)."""
 
+    inputs: Array
     x: Array
     slope: Array
     q: Array
@@ -350,13 +360,19 @@ class _Calls(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """A time between two nodes, `share` of the gap after the first."""
+    """A time between two nodes, `share` of the gap after the first.
+
+    Attributes:
+        weights: Of the beginning, the middle and the end of a step, in what drives it: a parabola.
+    """
 
     before: int
     after: int
     gap_s: float
     share: float
     t_s: float
+    fine: tuple[int, int, int]
+    weights: tuple[float, float, float]
     applied_n: float
     temperature_c: float
 
@@ -388,6 +404,7 @@ def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bo
         gap / substeps,
         step,
         substeps,
+        (at, min(at + 1, last), min(at + 2, last)),
         (fine[at], fine[min(at + 1, last)], fine[min(at + 2, last)]),
         temperature[node],
         temperature[after] - temperature[node],
@@ -396,16 +413,19 @@ def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bo
 
 @_inline
 def _instant(span: _Span, u: float) -> _Instant:
-    """The time at a share `u` of a step; the applied force as a parabola over it."""
+    """The time at a share `u` of a step; what drives it is a parabola over it."""
     f0, f1, f2 = span.applied_n
     share = (span.step + u) / span.steps
+    weights = ((1.0 - u) * (1.0 - 2.0 * u), 4.0 * u * (1.0 - u), u * (2.0 * u - 1.0))
     return _Instant(
         span.before,
         span.after,
         span.gap_s,
         share,
         span.first_s + (span.step + u) * span.step_s,
-        f0 * (1.0 - u) * (1.0 - 2.0 * u) + 4.0 * f1 * u * (1.0 - u) + f2 * u * (2.0 * u - 1.0),
+        span.fine,
+        weights,
+        f0 * weights[0] + f1 * weights[1] + f2 * weights[2],
         span.temperature_c + share * span.warming_k,
     )
 
@@ -437,21 +457,37 @@ def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
 
 
 @_inline
-def _move_struts(
-    equations: Equations, struts: Array, at: _Instant, work: _Work, tabulated: bool
-) -> None:
-    """Write the struts' heights, velocities and linear forces."""
+def _write_inputs(inputs: Array, at: _Instant, work: _Work) -> None:
+    """Write the input vector."""
+    (a, b, c), (early, middle, late) = at.fine, at.weights
+    for k in range(inputs.shape[1]):
+        work.inputs[k] = early * inputs[a, k] + middle * inputs[b, k] + late * inputs[c, k]
+
+
+@_inline
+def _add_moved(moved: Array, at: _Instant, work: _Work) -> None:
+    """Add what moved bodies do to heights and velocities."""
+    (a, b, c), (early, middle, late) = at.fine, at.weights
+    for i in range(moved.shape[2]):
+        work.heights_m[i] += (
+            early * moved[a, 0, i] + middle * moved[b, 0, i] + late * moved[c, 0, i]
+        )
+        work.velocities[i] += (
+            early * moved[a, 1, i] + middle * moved[b, 1, i] + late * moved[c, 1, i]
+        )
+
+
+@_inline
+def _move_struts(equations: Equations, at: _Instant, work: _Work, tabulated: bool) -> None:
+    """Write the struts' heights and velocities, but for what moved bodies add to them."""
     rows, heights, a, b = equations.jacobian, equations.heights_m, at.before, at.after
     n = rows.shape[2]
     for i in range(rows.shape[1]):
         height = heights[a, i]
         if tabulated:
             # Heights follow the reference by a cubic, and to first order in the distance from it.
-            early = 0.0
-            late = 0.0
-            for j in range(n):
-                early += at.gap_s * rows[a, i, j] * equations.v[a, j]
-                late += at.gap_s * rows[b, i, j] * equations.v[b, j]
+            early = at.gap_s * equations.rates_m_per_s[a, i]
+            late = at.gap_s * equations.rates_m_per_s[b, i]
             height += _cubic(heights[b, i] - heights[a, i], early, late, at.share)
         velocity = 0.0
         for j in range(n):
@@ -460,10 +496,16 @@ def _move_struts(
             velocity += row * work.x[n + j]
         work.heights_m[i] = height
         work.velocities[i] = velocity
+
+
+@_inline
+def _write_linear_forces(struts: Array, work: _Work) -> None:
+    """Write the forces of the struts' springs and dampers."""
+    for i in range(struts.shape[0]):
         work.forces_n[i] = (
             struts[i, PRELOAD]
-            - struts[i, STIFFNESS] * (height - struts[i, FREE_LENGTH])
-            - struts[i, DAMPING] * velocity
+            - struts[i, STIFFNESS] * (work.heights_m[i] - struts[i, FREE_LENGTH])
+            - struts[i, DAMPING] * work.velocities[i]
         )
 
 
@@ -490,11 +532,13 @@ def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work)
 def _accelerate(equations: Equations, at: _Instant, work: _Work) -> None:
     """Write the slope of coordinates and rates."""
     rows, a, b, share = equations.jacobian, at.before, at.after, at.share
-    bias, applied, inverses = equations.bias, equations.applied, equations.mass_inverse
+    bias, columns, inverses = equations.bias, equations.inputs, equations.mass_inverse
     n = rows.shape[2]
     for j in range(n):
         sum_n = bias[a, j] + share * (bias[b, j] - bias[a, j])
-        sum_n += (applied[a, j] + share * (applied[b, j] - applied[a, j])) * at.applied_n
+        for i in range(columns.shape[2]):
+            column = columns[a, j, i] + share * (columns[b, j, i] - columns[a, j, i])
+            sum_n += column * work.inputs[i]
         for i in range(rows.shape[1]):
             row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
             sum_n += row * work.forces_n[i]
@@ -513,12 +557,18 @@ def _accelerate(equations: Equations, at: _Instant, work: _Work) -> None:
 
 
 @_inline
-def _write_slope(model: Model, calls: _Calls, at: _Instant, work: _Work) -> None:
+def _write_slope(
+    model: Model, calls: _Calls, scenario: Scenario, at: _Instant, work: _Work
+) -> None:
     """Evaluate the differential equation at `work.x`."""
     tabulated = model.equations.jacobian.shape[0] > 1
     if tabulated:
         _follow_reference(model.equations, at, work)
-    _move_struts(model.equations, model.struts, at, work, tabulated)
+    _write_inputs(scenario.inputs, at, work)
+    _move_struts(model.equations, at, work, tabulated)
+    if scenario.moved.shape[0] > 0:
+        _add_moved(scenario.moved, at, work)
+    _write_linear_forces(model.struts, work)
     _add_effects(model.placement, calls, at, work)
     _accelerate(model.equations, at, work)
 
@@ -608,7 +658,7 @@ def _march(
                     # Nodes of the classical Runge-Kutta method: 0, 1/2, 1/2, 1.
                     u = (piece + 0.5 * ((stage + 1) // 2)) / pieces
                     _begin_stage(stage, h, step, work)
-                    _write_slope(model, calls, _instant(span, u), work)
+                    _write_slope(model, calls, scenario, _instant(span, u), work)
                     if stage == 0 and substep == 0 and piece == 0 and pieces == 1:
                         _record(model.equations, node, work, out)
                         if node + 1 == nodes:
@@ -629,9 +679,11 @@ def _march(
 # Signatures of what is kept on disk hold plain tuples: numba's index of it names the classes of
 # a signature, and could not be read after one of them was renamed.
 _PLACEMENT = types.UniTuple(_INTEGERS, 3)
-_EQUATIONS = types.Tuple((_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _MATRIX, _MATRIX))
+_EQUATIONS = types.Tuple(
+    (_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _CUBE, _MATRIX, _MATRIX)
+)
 _MODEL = types.Tuple((_PLACEMENT, _VECTOR, _MATRIX, _EQUATIONS))
-_SCENARIO = types.UniTuple(_VECTOR, 4)
+_SCENARIO = types.Tuple((*(_VECTOR,) * 4, _MATRIX, _CUBE))
 _STEPS = types.Tuple((_I8, _F8, _F8))
 _TRAJECTORY = types.UniTuple(_MATRIX, 3)
 
@@ -659,7 +711,8 @@ def _simulate(
         parameters[slot] = placement.first_parameters[slot]
         strut[slot] = placement.struts[slot] * struts.shape[1]
     work = _Work(
-        start.copy(), np.zeros(size), equations.q[0].copy(), equations.v[0].copy(),
+        np.zeros(equations.inputs.shape[2]), start.copy(), np.zeros(size),
+        equations.q[0].copy(), equations.v[0].copy(),
         np.zeros(n), np.zeros(count), np.zeros(count), np.zeros(count),
     )  # fmt: skip
     calls = _Calls(

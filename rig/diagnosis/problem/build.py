@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.problem import linear_part, track
+from rig.diagnosis.problem.drive import drive_of_recording
 from rig.diagnosis.problem.free_run import FreeRunProblem
 from rig.diagnosis.problem.grid import SmoothRecording, smooth_recording, strut_motions
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
@@ -89,10 +90,12 @@ def build(
     smooth = _smooth(recordings, held_out)
     plants = open_plants(spec)
     motions = strut_motions(spec, smooth)
-    mechanism = mechanism_along(plants, smooth[0].motion)
+    first = smooth[0]
+    drive = drive_of_recording(spec, first.recording)
+    mechanism = mechanism_along(plants, first.motion, drive.at(first.grid.t_s))
     masses = [linear_part.moving_mass_kg(mechanism, i) for i in range(len(motions))]
     motions = tuple(m._replace(mass_kg=mass) for m, mass in zip(motions, masses, strict=True))
-    linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism)
+    linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism, drive)
     existing = track.existing_effects(spec, [recording.motion for recording in smooth])
     basis = ProblemBasis(spec, linear, existing, motions, block_s, plants)
     return _divide_at_gaps(kind.of_recordings(basis, smooth), smooth)
@@ -107,16 +110,16 @@ def _smooth(
 
 
 def _divide_at_gaps(problem: Problem, recordings: Sequence[SmoothRecording]) -> Problem:
-    """The problem of the pieces between gaps of the applied force that are not interpolated.
+    """The problem of the pieces between gaps of the inputs that are not interpolated.
 
     Raises:
         RecordingError: Less than half of a recording lies in pieces that are long enough.
     """
-    if not any(it.recording.force_gaps and it.recording.force_gaps.long_s for it in recordings):
+    if not any(it.recording.gaps and it.recording.gaps.long_s for it in recordings):
         return problem
     pieces: list[tuple[int, slice]] = []
     for k, (recording, grid, *_) in enumerate(recordings):
-        gaps = recording.force_gaps
+        gaps = recording.gaps
         between = grid.pieces_between(() if gaps is None else gaps.long_s)
         left = sum(piece.stop - piece.start for piece in between) / len(grid.t_s)
         if gaps is not None and left < _MOSTLY:
@@ -135,18 +138,19 @@ def _is_fitted(problem: Problem, k: int, piece: slice) -> bool:
 
 
 def problem_kind(recordings: Sequence[Recording]) -> type[Problem]:
-    """The kind of problem of recordings: with a load cell and no applied force, prescribed motion.
+    """The kind of problem of recordings: with a load cell and no input, prescribed motion.
 
     Raises:
         RecordingError: Some are of one kind and some of the other.
     """
-    prescribed = [recording.applied_force_n is None for recording in recordings]
+    prescribed = [not recording.inputs for recording in recordings]
     if any(prescribed) and not all(prescribed):
         dyno = recordings[prescribed.index(True)].name
         driven = recordings[prescribed.index(False)].name
         raise RecordingError(
-            f"{dyno}: has strut_force_n alone, so its motion is prescribed, and {driven} has "
-            "applied_force_n: expected runs of one kind, diagnose the others by themselves"
+            f"{dyno}: has strut_force_n alone, so its motion is prescribed, and {driven} has an "
+            "applied force or another input: expected runs of one kind, diagnose the others by "
+            "themselves"
         )
     return PrescribedProblem if all(prescribed) else FreeRunProblem
 

@@ -1,4 +1,4 @@
-"""A recording of a force-driven bench, ready to be simulated, and the motion that results."""
+"""A recording of a driven bench, ready to be simulated, and the motion that results."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from rig.diagnosis.numerics.compiled import Trajectory
-from rig.diagnosis.numerics.smoother import estimate_noise
+from rig.diagnosis.problem.drive import Drive
 from rig.diagnosis.problem.grid import RecordingGrid, Track, fine_times
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 
@@ -17,31 +17,46 @@ _STEP_ANGLE = 0.2
 """Longest step as an angle of the model's fastest motion: the integrator errs by 1e-5 a radian."""
 _LONGEST_STEP_S = 1.25e-3
 """Longest step where the motion is slow: laws that switch need it."""
-_LARGEST_INPUT_NOISE = 0.01
-"""Share of an applied force's range from which on its rough part is excitation, not noise."""
-_TOP = 0.8
-"""Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
-actuator end below, so that only noise is left above."""
 
 
 class DrivenRun(NamedTuple):
     """A recording as it is simulated.
 
     Attributes:
-        applied_n: Applied force at the nodes, shape (N,).
-        fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
+        drive: What drove it.
+        fine: Input vector at half sub-steps, shape (2 * substeps * (N - 1) + 1, inputs).
+        moved: What moved bodies add to heights and to their rates there, shape (as above, 2,
+            struts); empty where no body is moved.
         angle: Angle by which the fastest motion turns within such a step.
         cells: Load cells, to evaluate on: their own times, shape (samples,), and the force of each
             strut, shape (samples, struts), NaN for a strut without a cell; None where none is.
     """
 
     grid: RecordingGrid
-    applied_n: Array
-    fine_n: Array
+    drive: Drive
+    fine: Array
+    moved: Array
     substeps: int
     angle: float
     mechanism: LinearisedMechanism
     cells: tuple[Array, Array] | None
+
+    @property
+    def inputs(self) -> Array:
+        """Input vector at the nodes, shape (N, inputs)."""
+        return np.ascontiguousarray(self.fine[:: 2 * self.substeps])
+
+    @property
+    def applied_n(self) -> Array:
+        """Applied force of laws at the nodes, shape (N,)."""
+        return self.drive.applied_n(self.inputs)
+
+    @property
+    def moved_at_nodes(self) -> Array:
+        """What moved bodies add to heights and their rates at the nodes, shape (N, 2, struts)."""
+        if not len(self.moved):
+            return np.zeros((len(self.grid.t_s), 2, self.grid.heights_m.shape[1]))
+        return self.moved[:: 2 * self.substeps]
 
     def cut(self, nodes: slice) -> "DrivenRun":
         """The recording at some of the nodes."""
@@ -52,8 +67,8 @@ class DrivenRun(NamedTuple):
             cells = cells[0][there], cells[1][there]
         return self._replace(
             grid=grid,
-            applied_n=self.applied_n[nodes],
-            fine_n=self.fine_n[fine],
+            fine=self.fine[fine],
+            moved=self.moved[fine],
             mechanism=self.mechanism.cut(nodes),
             cells=cells,
         )
@@ -61,9 +76,15 @@ class DrivenRun(NamedTuple):
     def finer(self) -> "DrivenRun":
         """The recording with steps half as long."""
         steps = 2 * self.substeps
-        spline = CubicSpline(fine_times(self.grid.t_s, steps), self.fine_n)
-        fine_n = np.ascontiguousarray(spline(fine_times(self.grid.t_s, 2 * steps)))
-        return self._replace(fine_n=fine_n, substeps=steps, angle=0.5 * self.angle)
+        spline = CubicSpline(fine_times(self.grid.t_s, steps), self.fine)
+        fine = np.ascontiguousarray(spline(fine_times(self.grid.t_s, 2 * steps)))
+        moved = _moved(self.drive, self.mechanism, fine)
+        return self._replace(fine=fine, moved=moved, substeps=steps, angle=0.5 * self.angle)
+
+    def disturbed(self, noise: Array) -> "DrivenRun":
+        """The recording with other inputs, the difference given as `fine`."""
+        fine = self.fine + noise
+        return self._replace(fine=fine, moved=_moved(self.drive, self.mechanism, fine))
 
 
 def track_of(motion: Trajectory, run: DrivenRun) -> Track:
@@ -76,23 +97,23 @@ def track_of(motion: Trajectory, run: DrivenRun) -> Track:
 
 def driven_run(
     grid: RecordingGrid,
-    applied: tuple[Array, Array],
+    drive: Drive,
     mechanism: LinearisedMechanism,
     fastest: float,
     cells: tuple[Array, Array] | None,
 ) -> DrivenRun:
-    """A recording ready to be simulated; the applied force as a cubic spline between its samples.
+    """A recording ready to be simulated.
 
-    `applied` are times and values of that, `fastest` is the model's largest eigenvalue in rad/s.
+    `fastest` is the model's largest eigenvalue in rad/s.
     """
     usual = grid.step_s
     substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))
-    fine = CubicSpline(*applied)(fine_times(grid.t_s, 2 * substeps))
-    fine_n = np.ascontiguousarray(fine, dtype=np.float64)
+    fine = np.ascontiguousarray(drive.at(fine_times(grid.t_s, 2 * substeps)), dtype=np.float64)
     return DrivenRun(
         grid,
-        np.ascontiguousarray(fine_n[:: 2 * substeps]),
-        fine_n,
+        drive,
+        fine,
+        _moved(drive, mechanism, fine),
         substeps,
         fastest * usual / substeps,
         mechanism,
@@ -100,19 +121,22 @@ def driven_run(
     )
 
 
-def input_noise_n(run: "DrivenRun") -> float:
-    """Standard deviation of the applied force's noise and resolution.
-
-    White noise fills the whole band. What is not smooth, but not at the top of the band either, is
-    excitation.
-    """
-    force = run.applied_n - run.applied_n.mean()
-    variance = estimate_noise(run.grid.t_s, force).variance
-    window = np.hanning(len(force))
-    power = np.abs(np.fft.rfft(force * window)) ** 2 / float(window @ window)
-    # Lines of a periodogram are exponentially distributed: their median is ln 2 of their mean.
-    top = float(np.median(power[int(_TOP * len(power)) :])) / np.log(2.0)
-    return min(float(np.sqrt(min(variance, top))), _LARGEST_INPUT_NOISE * float(np.ptp(force)))
+def _moved(drive: Drive, mechanism: LinearisedMechanism, fine: Array) -> Array:
+    """What moved bodies add to heights and to their rates, as `DrivenRun.moved`."""
+    positions = drive.moved
+    if not positions:
+        return np.empty((0, 2, mechanism.heights_m.shape[1]))
+    jacobian = mechanism.moved
+    if len(jacobian) == 1:
+        parts = [fine[:, [first + rate for first in positions]] @ jacobian[0].T for rate in (0, 1)]
+        return np.ascontiguousarray(np.stack(parts, axis=1))
+    # The heights of the table have the motion; their rates are those of the free coordinates.
+    share = np.linspace(0.0, len(jacobian) - 1.0, len(fine))
+    before = np.minimum(share.astype(np.int64), len(jacobian) - 2)
+    share = (share - before)[:, np.newaxis, np.newaxis]
+    between = jacobian[before] + share * (jacobian[before + 1] - jacobian[before])
+    rates = np.einsum("kij,kj->ki", between, fine[:, [first + 1 for first in positions]])
+    return np.ascontiguousarray(np.stack([np.zeros_like(rates), rates], axis=1))
 
 
 def first_motion(grid: RecordingGrid) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Free-run simulation under the applied force: the residual is measured less simulated height.
+"""Free-run simulation under the measured inputs: the residual is measured less simulated height.
 
 The regression along the motion rests on an identity. Let the reference be a simulation with the
 linear dynamics G (heights by force). The residual of the measured heights is G applied to the
@@ -17,18 +17,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dart_model.effects import Bench
-from dart_model.spec import ModelSpec
+from dart_model.spec import WORLD, ModelSpec
+from rig.channels.measured_quantities import MOTION
 from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
-from rig.diagnosis.problem.driven_run import (
-    DrivenRun,
-    driven_run,
-    first_motion,
-    input_noise_n,
-    track_of,
-)
+from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
+from rig.diagnosis.problem.driven_run import DrivenRun, driven_run, first_motion, track_of
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
     SmoothRecording,
@@ -81,10 +77,6 @@ class FreeRunProblem(Problem):
     """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
-    assumption: ClassVar[str] = (
-        "The initial state of every recording is fitted, for both models; between samples the "
-        "applied force is a cubic spline."
-    )
     runs: tuple[DrivenRun, ...]
     noise_m: Array
 
@@ -100,6 +92,33 @@ class FreeRunProblem(Problem):
         return problem.with_noise_of(
             nominal_model(problem, first_starts(problem, nominal(problem)))
         )
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        drive = self.runs[0].drive
+        notes = ["The initial state of every recording is fitted, for both models."]
+        if drive.has_force:
+            notes.append("Between samples an applied force is a cubic spline.")
+        if drive.moved:
+            notes.append(
+                "Measured motions of bodies are smoothed over the whole recording; velocity and "
+                "acceleration follow from them."
+            )
+        if not drive.has_force:
+            scale = self._scale_body()
+            notes.append(
+                "No force drives the bench: the recordings determine masses, stiffnesses, dampings "
+                f"and forces up to a common factor. The mass of {scale} is taken as the model has "
+                "it; all others are proportional to it."
+            )
+        return tuple(notes)
+
+    def _scale_body(self) -> str:
+        """Body whose mass sets the scale: that of the strut without a correction of its mass."""
+        corrected = {item.strut for item in self.linear if item.kind == "mass"}
+        strut = next(strut for i, strut in enumerate(self.spec.struts) if i not in corrected)
+        lower, upper = strut.between
+        return upper if upper != WORLD else lower
 
     @property
     def grids(self) -> tuple[RecordingGrid, ...]:
@@ -120,8 +139,8 @@ class FreeRunProblem(Problem):
         return max(motion.stroke_m for motion in self.motions)
 
     @cached_property
-    def _input_noise_n(self) -> tuple[float, ...]:
-        return tuple(input_noise_n(run) for run in self.runs)
+    def _input_noise(self) -> tuple[tuple[float, ...], ...]:
+        return tuple(noise_stds(run.drive, run.grid.t_s) for run in self.runs)
 
     def blocks(self, k: int) -> Integers:
         return np.repeat(self.runs[k].grid.blocks(self.block_s), len(self.noise_m))
@@ -130,9 +149,9 @@ class FreeRunProblem(Problem):
         """Coordinates and velocities from a parabola through the first samples; states at zero."""
         grid, mechanism = self.runs[k].grid, self.runs[k].mechanism
         heights, velocities = first_motion(grid)
-        jacobian = mechanism.jacobian[0]
-        q = mechanism.q[0] + np.linalg.solve(jacobian, heights - mechanism.heights_m[0])
-        v = np.linalg.solve(jacobian, velocities)
+        jacobian, (moved_m, moved) = mechanism.jacobian[0], self.runs[k].moved_at_nodes[0]
+        q = mechanism.q[0] + np.linalg.solve(jacobian, heights - mechanism.heights_m[0] - moved_m)
+        v = np.linalg.solve(jacobian, velocities - moved)
         return np.concatenate([q, v, np.zeros(slots_of(self, candidate).states)])
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
@@ -159,13 +178,21 @@ class FreeRunProblem(Problem):
         motion = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
         inverse = np.ascontiguousarray(np.linalg.inv(m.mass), dtype=np.float64)
         equations = Equations(
-            inverse, m.bias, m.bias_q, m.bias_v, m.jacobian, m.heights_m, m.applied, m.q, m.v
-        )
+            inverse, m.bias, m.bias_q, m.bias_v, m.jacobian, m.heights_m, m.rates_m_per_s,
+            m.inputs, m.q, m.v,
+        )  # fmt: skip
         slots, struts = slots_of(self, model.candidate), strut_constants(self, parts.linear)
         finite = simulate(
             slots.laws,
             Model(slots.placement, parts.effects, struts, equations),
-            Scenario(start, run.grid.t_s, run.fine_n, run.grid.temperature_c),
+            Scenario(
+                start,
+                run.grid.t_s,
+                run.drive.applied_n(run.fine),
+                run.grid.temperature_c,
+                run.fine,
+                run.moved,
+            ),
             Steps(run.substeps, _BEND * run.angle**2, self._stroke_m),
             motion,
         )
@@ -203,7 +230,7 @@ class FreeRunProblem(Problem):
         return replace(self, noise_m=np.maximum(noise, 1e-300))
 
     def floor_level(self, model: CandidateModel) -> float:
-        """One for the heights' noise, and what noise of the applied forces adds in simulation."""
+        """One for the heights' noise, and what noise of the inputs adds in simulation."""
         squares = [
             float(np.mean((heights_m / self.noise_m) ** 2))
             for k in range(self.recordings)
@@ -212,22 +239,20 @@ class FreeRunProblem(Problem):
         return 1.0 + (float(np.mean(squares)) if squares else 0.0)
 
     def disturbances_m(self, k: int, model: CandidateModel, draws: int) -> list[Array]:
-        """Heights that draws of the applied force's noise cause, drift of springless axes included.
+        """Heights that draws of the inputs' noise cause, drift of springless axes included.
 
         Each of shape (N, struts); an empty list where there is no noise, or the model runs away.
         """
         run, start = self.runs[k], model.parts.starts[k]
-        noise = self._input_noise_n[k]
-        motion = self.simulate(run, model, start) if noise > 0.0 else None
+        stds = self._input_noise[k]
+        motion = self.simulate(run, model, start) if any(stds) else None
         if motion is None:
             return []
         rng = np.random.default_rng(0)
         disturbances: list[Array] = []
         for _ in range(draws):
-            # White between samples: the error of the force is held over a sample or so.
-            nodes = noise * rng.standard_normal(len(run.grid.t_s))
-            fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
-            disturbed = self.simulate(run._replace(fine_n=run.fine_n + fine), model, start)
+            noise = draw_noise(run.drive, stds, run.grid.t_s, 2 * run.substeps, rng)
+            disturbed = self.simulate(run.disturbed(noise), model, start)
             if disturbed is not None:
                 disturbances.append(disturbed.heights_m - motion.heights_m)
         return disturbances
@@ -252,7 +277,7 @@ class FreeRunProblem(Problem):
         )
         along = track_of(Trajectory(z, w, a), run)
         forces = track.strut_forces(self, model, along, self.states(k, model))
-        needed = m.strut_forces_of_motion(z, w, a, run.applied_n)
+        needed = m.strut_forces_of_motion(z, w, a, run.inputs, run.moved_at_nodes)
         spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
         constants = strut_constants(self, parts.linear)
         inertia = m.strut_inertia()
@@ -309,7 +334,8 @@ class FreeRunProblem(Problem):
         z = CubicHermiteSpline(grid.t_s[cut], motion[0], motion[1])(t_s)
         w = CubicHermiteSpline(grid.t_s[cut], motion[1], motion[2])(t_s)
         acceleration = CubicSpline(grid.t_s[cut], motion[2])(t_s)
-        applied = CubicSpline(grid.t_s, run.applied_n)(t_s)
+        inputs = CubicSpline(grid.t_s, run.inputs)(t_s)
+        applied = run.drive.applied_n(inputs)
         temperature_c = np.interp(t_s, grid.t_s, grid.temperature_c)
         along = Track.of_columns(t_s, z, w, applied, temperature_c)
         rows = np.flatnonzero(grid.fitted[cut])
@@ -320,7 +346,7 @@ class FreeRunProblem(Problem):
             """Whitened heights (m,) under generalised forces (N, n)."""
             return (dynamics.heights(forces)[rows * every] * weight).ravel()
 
-        mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s)
+        mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s, inputs)
 
         def respond_to(strut: int, force: Array) -> Array:
             return whiten_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
@@ -357,7 +383,7 @@ class FreeRunProblem(Problem):
     def evaluate(
         self, k: int, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
     ) -> RunEvaluation:
-        """Figures of a held-out recording: heights are DART's, with the applied force as input."""
+        """Figures of a held-out recording: heights are DART's, driven as measured."""
         del fitted_rms_n
         run = self.runs[k]
         grid, rows = run.grid, select_nodes(run.grid, blocks=blocks)
@@ -427,16 +453,15 @@ class FreeRunProblem(Problem):
 
 def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:
     recording = smooth.recording
-    if recording.applied_force_n is None:
-        raise RecordingError(f"{recording.name}: expected a column applied_force_n")
-    applied = (recording.t_s, recording.applied_force_n)
-    motion = smooth.motion._replace(applied_n=np.interp(smooth.grid.t_s, *applied))
-    mechanism = mechanism_along(basis.plants, motion)
-    _check_columns(basis.spec, recording, mechanism)
+    drive = drive_of_recording(basis.spec, recording)
+    inputs = drive.at(smooth.grid.t_s)
+    motion = smooth.motion._replace(applied_n=drive.applied_n(inputs))
+    mechanism = mechanism_along(basis.plants, motion, inputs)
+    _check_columns(basis.spec, recording, mechanism, inputs)
     cells = recording.strut_forces_n
     return driven_run(
         smooth.grid,
-        applied,
+        drive,
         mechanism,
         _fastest(basis.spec, mechanism),
         None if cells is None else (recording.t_s, cells),
@@ -453,11 +478,16 @@ def _fastest(spec: ModelSpec, m: LinearisedMechanism) -> float:
     return max(float(np.max(np.abs(poles))), 1e-9)
 
 
-def _check_columns(spec: ModelSpec, recording: Recording, mechanism: LinearisedMechanism) -> None:
-    """Refuse heights that the applied force cannot have caused."""
+def _check_columns(
+    spec: ModelSpec, recording: Recording, mechanism: LinearisedMechanism, inputs: Array
+) -> None:
+    """Refuse heights that what drives the bench cannot have caused."""
     load = float(np.max(np.abs(mechanism.bias)))
-    if recording.applied_force_n is not None:
-        load += float(np.max(np.abs(recording.applied_force_n)))
+    load += float(np.max(np.abs(mechanism.inputs) @ np.abs(inputs).max(axis=0)))
+    stiffest = max(strut.stiffness_n_per_m for strut in spec.struts)
+    for item in recording.inputs.values():
+        if item.quantity is MOTION:
+            load += stiffest * float(np.ptp(item.values))
     for strut, height_m in zip(spec.struts, recording.heights_m.T, strict=True):
         if strut.stiffness_n_per_m <= 0.0:
             continue

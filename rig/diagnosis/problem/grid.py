@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C, Motion
 from dart_model.spec import ModelSpec
+from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
 from rig.recordings.recording import Recording, RecordingError
 
@@ -215,9 +216,11 @@ def _place_on_nodes(recording: Recording) -> tuple[RecordingGrid, Integers]:
 
 
 def _largest_force_std_n(recordings: Sequence[SmoothRecording]) -> float:
-    """Largest standard deviation of a measured force."""
-    channels = ((r.recording.applied_force_n, r.recording.strut_forces_n) for r in recordings)
-    return max(float(np.nanstd(c)) for pair in channels for c in pair if c is not None)
+    """Largest standard deviation of a measured force; 1 N where none was measured."""
+    forces = [r.recording.strut_forces_n for r in recordings]
+    inputs = [item for r in recordings for item in r.recording.inputs.values()]
+    forces += [item.values for item in inputs if item.quantity is APPLIED_FORCE]
+    return max((float(np.nanstd(c)) for c in forces if c is not None), default=1.0)
 
 
 def strut_motions(spec: ModelSpec, recordings: Sequence[SmoothRecording]) -> tuple[Motion, ...]:

@@ -23,13 +23,18 @@ _SETTLES_WITHIN = 0.15
 
 
 class FilterMechanism:
-    """The mechanism, given at nodes, on the grid `t_s` of the filter."""
+    """The mechanism, given at nodes, on the grid `t_s` (N,) of the filter.
 
-    def __init__(self, mechanism: LinearisedMechanism, nodes_s: Array, t_s: Array) -> None:
+    `inputs` is the input vector on that grid, shape (N, inputs).
+    """
+
+    def __init__(
+        self, mechanism: LinearisedMechanism, nodes_s: Array, t_s: Array, inputs: Array
+    ) -> None:
         at = np.zeros(len(t_s), dtype=np.int64)
         if len(mechanism.q) > 1:
             at = np.clip(np.searchsorted(nodes_s, t_s - 1e-12), 0, len(nodes_s) - 1)
-        self._mechanism, self._at = mechanism, at
+        self._mechanism, self._at, self._inputs = mechanism, at, inputs
         self.jacobian = mechanism.jacobian[at]
 
     def unit_force(
@@ -44,9 +49,12 @@ class FilterMechanism:
         if parameter.kind == "mass":
             q = np.linalg.solve(self.jacobian, accelerations_m_per_s2[..., np.newaxis])[..., 0]
             inertia = np.einsum("kij,kj->ki", self._mechanism.mass_by_kg[self._at, strut], q)
-            return self._mechanism.bias_by_kg[self._at, strut] - inertia
+            inputs = self._mechanism.inputs_by_kg[self._at, strut]
+            driven = np.einsum("kij,kj->ki", inputs, self._inputs)
+            return self._mechanism.bias_by_kg[self._at, strut] + driven - inertia
         if parameter.kind == "gain":
-            return self._mechanism.applied[self._at] * track.applied_n[:, np.newaxis]
+            column = self._mechanism.inputs[self._at][:, :, parameter.input]
+            return column * self._inputs[:, parameter.input, np.newaxis]
         height_m, velocity = track.heights_m[strut], track.velocities_m_per_s[strut]
         force = linear_part.strut_force(parameter.kind, height_m, velocity, motions[strut])
         return self.jacobian[:, strut] * force[:, np.newaxis]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Bench, Motion, effect
 from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
+from rig.diagnosis.problem.drive import Drive
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 from rig.diagnosis.problem.problem import Kind, LinearParameter, mid_stroke_m
 
@@ -50,9 +51,19 @@ EFFECTS = {
 
 
 def linear_parameters(
-    spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: LinearisedMechanism
+    spec: ModelSpec,
+    bench: Bench,
+    motions: Sequence[Motion],
+    mechanism: LinearisedMechanism,
+    drive: Drive,
 ) -> tuple[LinearParameter, ...]:
-    """Linear parameters of a model that a bench can show, with their priors."""
+    """Linear parameters of a model that a bench can show, with their priors.
+
+    Where no force drives the bench, the data determine masses, stiffnesses, dampings and forces of
+    laws up to a common factor: the largest moving mass is then not corrected, and sets the scale.
+    """
+    masses = [moving_mass_kg(mechanism, i) for i in range(len(motions))]
+    scale_strut = -1 if drive.has_force else int(np.argmax(masses))
     parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
         stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
@@ -67,16 +78,22 @@ def linear_parameters(
             ("preload", 0.0, preload_scale, -np.inf),
             ("free_length", strut.free_length_m, motion.stroke_m, -np.inf),
         ]
-        if bench == "force_given":
-            mass = moving_mass_kg(mechanism, i)
+        if bench == "force_given" and i != scale_strut:
+            mass = masses[i]
             kinds.append(("mass", mass, mass, -(1.0 - _LEAST_MASS) * mass))
         parameters += [
             LinearParameter(i, kind, value, _deviation(spec, kind, scale), least)
             for kind, value, scale, least in kinds
         ]
-    if bench == "force_given" and _along_last_strut(mechanism):
+    first_force = drive.first_force
+    if (
+        bench == "force_given"
+        and first_force is not None
+        and _along_last_strut(mechanism, first_force)
+    ):
+        deviation = _deviation(spec, "gain", 1.0)
         parameters.append(
-            LinearParameter(len(motions) - 1, "gain", 1.0, _deviation(spec, "gain", 1.0), -0.95)
+            LinearParameter(len(motions) - 1, "gain", 1.0, deviation, -0.95, first_force)
         )
     return tuple(parameters)
 
@@ -98,9 +115,10 @@ def moving_mass_kg(mechanism: LinearisedMechanism, strut: int) -> float:
     return float(np.min(np.diag(mass)[loaded] / np.diag(per_kg)[loaded]))
 
 
-def _along_last_strut(mechanism: LinearisedMechanism) -> bool:
+def _along_last_strut(mechanism: LinearisedMechanism, first_force: int) -> bool:
     """Whether the applied force acts as a force in the last strut would."""
-    return bool(np.allclose(mechanism.applied, mechanism.jacobian[:, -1], rtol=1e-9, atol=1e-12))
+    applied = mechanism.inputs[:, :, first_force]
+    return bool(np.allclose(applied, mechanism.jacobian[:, -1], rtol=1e-9, atol=1e-12))
 
 
 def strut_force(kind: Kind, height_m: Array, velocity_m_per_s: Array, motion: Motion) -> Array:
@@ -116,18 +134,18 @@ def with_linear_changes(
     mechanism: LinearisedMechanism, linear: Sequence[LinearParameter], changes: Array
 ) -> LinearisedMechanism | None:
     """The mechanism with masses and gain changed; None if the mass matrix is not positive."""
-    mass, bias, bias_q, applied = (
-        mechanism.mass, mechanism.bias, mechanism.bias_q, mechanism.applied
-    )  # fmt: skip
+    mass, bias, inputs = mechanism.mass, mechanism.bias, mechanism.inputs
     for parameter, change in zip(linear, changes, strict=True):
         if parameter.kind == "mass" and change != 0.0:
             mass = mass + change * mechanism.mass_by_kg[:, parameter.strut]
             bias = bias + change * mechanism.bias_by_kg[:, parameter.strut]
+            inputs = inputs + change * mechanism.inputs_by_kg[:, parameter.strut]
         elif parameter.kind == "gain" and change != 0.0:
-            applied = (1.0 + change) * applied
+            inputs = inputs.copy()
+            inputs[:, :, parameter.input] *= 1.0 + change
     if float(np.min(np.linalg.eigvalsh(mass[:1]))) <= 0.0:
         return None
-    return mechanism._replace(mass=mass, bias=bias, bias_q=bias_q, applied=applied)
+    return mechanism._replace(mass=mass, bias=bias, inputs=inputs)
 
 
 def spec_with_linear_changes(

@@ -30,28 +30,35 @@ class LinearisedMechanism(NamedTuple):
         q: Reference coordinates, shape (K, n).
         v: Their rates, shape (K, n).
         heights_m: Strut heights there, shape (K, struts).
+        rates_m_per_s: Their rates, shape (K, struts).
         jacobian: Jacobian of the struts, shape (K, struts, n).
-        applied: Generalised force per newton of applied force, shape (K, n).
+        inputs: Generalised force per unit of each input, shape (K, n, inputs).
+        moved: Derivative of the heights by the positions of moved bodies, shape
+            (K, struts, motions).
         mass: Mass matrix, shape (K, n, n).
-        bias: Generalised force of all but struts and applied force, shape (K, n).
+        bias: Generalised force of all but struts and inputs, shape (K, n).
         bias_q: Its derivative by the coordinates, shape (K, n, n).
         bias_v: Its derivative by their rates, shape (K, n, n).
         mass_by_kg: Change of the mass matrix by a kg on each strut's body, shape
             (K, struts, n, n).
         bias_by_kg: The same of the bias force, shape (K, struts, n).
+        inputs_by_kg: The same of the inputs, shape (K, struts, n, inputs).
     """
 
     q: Array
     v: Array
     heights_m: Array
+    rates_m_per_s: Array
     jacobian: Array
-    applied: Array
+    inputs: Array
+    moved: Array
     mass: Array
     bias: Array
     bias_q: Array
     bias_v: Array
     mass_by_kg: Array
     bias_by_kg: Array
+    inputs_by_kg: Array
 
     @property
     def coordinates(self) -> int:
@@ -62,13 +69,24 @@ class LinearisedMechanism(NamedTuple):
         """The mechanism at some of the nodes."""
         return self if len(self.q) == 1 else LinearisedMechanism(*(part[nodes] for part in self))
 
-    def strut_forces_of_motion(self, z: Array, w: Array, a: Array, applied_n: Array) -> Array:
-        """Strut forces that heights, their rates and accelerations take, each (N, struts)."""
+    def strut_forces_of_motion(
+        self, z: Array, w: Array, a: Array, inputs: Array, moved: Array
+    ) -> Array:
+        """Strut forces that heights, their rates and accelerations take, each (N, struts).
+
+        Args:
+            z: Heights.
+            w: Their rates.
+            a: Their second derivatives, without what moved bodies add to them.
+            inputs: Input vector, shape (N, inputs).
+            moved: What moved bodies add to heights and their rates, shape (N, 2, struts).
+        """
         every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
-        q = self.q[every] + _solve_coordinates(jacobian, z - self.heights_m[every])
-        v, acceleration = _solve_coordinates(jacobian, w), _solve_coordinates(jacobian, a)
-        bias = self.bias[every] + self.applied[every] * applied_n[:, np.newaxis]
+        q = self.q[every] + _solve_coordinates(jacobian, z - self.heights_m[every] - moved[:, 0])
+        v = _solve_coordinates(jacobian, w - moved[:, 1])
+        acceleration = _solve_coordinates(jacobian, a)
+        bias = self.bias[every] + np.einsum("kij,kj->ki", self.inputs[every], inputs)
         bias = bias + np.einsum("kij,kj->ki", self.bias_q[every], q - self.q[every])
         bias = bias + np.einsum("kij,kj->ki", self.bias_v[every], v - self.v[every])
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
@@ -98,10 +116,10 @@ def open_plants(spec: ModelSpec) -> MechanismPlants:
         kept = [e for e in strut.effects if e.name in ("added_mass", "inerter")]
         bare = bare.with_effects(strut.name, kept)
     plain = DartPlant(bare)
-    if plain.coordinates != len(spec.struts):
+    if plain.free_coordinates != len(spec.struts):
         raise RecordingError(
-            f"model {spec.name}: {plain.coordinates} coordinates and {len(spec.struts)} struts, "
-            "expected as many of each, so that the measured heights give the motion"
+            f"model {spec.name}: {plain.free_coordinates} coordinates and {len(spec.struts)} "
+            "struts, expected as many of each, so that the measured heights give the motion"
         )
     heavier = tuple(
         DartPlant(bare.with_effects(strut.name, (*bare.strut(strut.name).effects, _ONE_KG)))
@@ -110,21 +128,32 @@ def open_plants(spec: ModelSpec) -> MechanismPlants:
     return MechanismPlants(plain, heavier)
 
 
-def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechanism:
-    """The mechanism along a measured motion: constant where it can be, and with FMUs' forces."""
+def mechanism_along(plants: MechanismPlants, motion: Track, inputs: Array) -> LinearisedMechanism:
+    """The mechanism along a measured motion: constant where it can be, and with FMUs' forces.
+
+    `inputs` is the input vector at the motion's times, shape (N, inputs).
+    """
     if plants.plain.is_constant:
         mechanism = constant_mechanism(plants)
     else:
-        mechanism = tabulate_mechanism(plants, motion.heights_m.T, motion.velocities_m_per_s.T)
-    return _with_mockups(mechanism, plants.plain, motion)
+        mechanism = tabulate_mechanism(
+            plants, motion.heights_m.T, motion.velocities_m_per_s.T, inputs
+        )
+    return _with_mockups(mechanism, plants.plain, motion, inputs)
 
 
 def _with_mockups(
-    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
+    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track, inputs: Array
 ) -> LinearisedMechanism:
     """The mechanism with the forces of FMUs, along a motion and linear about it."""
     if not any(plant.mockups):
         return mechanism
+    if mechanism.moved.shape[2]:
+        raise RecordingError(
+            f"model {plant.spec.name}: an FMU in a strut of a bench whose bodies are moved is not "
+            "supported in a diagnosis, expected a bench that is driven by forces"
+        )
+    del inputs
     nodes = len(motion.t_s)
     m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
     heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
@@ -141,35 +170,58 @@ def _with_mockups(
             bias = bias + row * force_n[:, np.newaxis]
             bias_q = bias_q + square * by_height[:, np.newaxis, np.newaxis]
             bias_v = bias_v + square * by_velocity[:, np.newaxis, np.newaxis]
-    linearised = m._replace(q=q, v=v, heights_m=heights_m, bias=bias, bias_q=bias_q, bias_v=bias_v)
+    linearised = m._replace(
+        q=q,
+        v=v,
+        heights_m=heights_m,
+        rates_m_per_s=velocities,
+        bias=bias,
+        bias_q=bias_q,
+        bias_v=bias_v,
+    )
     return LinearisedMechanism(*(np.ascontiguousarray(part) for part in linearised))
 
 
 def constant_mechanism(plants: MechanismPlants) -> LinearisedMechanism:
     """The mechanism of bodies on straight guides."""
-    n = plants.plain.coordinates
-    return _stack([_mechanism_at(plants, np.zeros(n), np.zeros(n))])
+    plain = plants.plain
+    n = plain.coordinates
+    here = _mechanism_at(plants, np.zeros(n), np.zeros(n))
+    # About rest at zero, what moved bodies do by where they are and how fast is a part of it.
+    by_position, by_velocity = plain.bias_slopes_by_motion(np.zeros(n), np.zeros(n))
+    inputs = here.inputs.copy()
+    inputs[:, plain.motion_columns] += by_position
+    inputs[:, plain.motion_columns + 1] += by_velocity
+    return _stack([here._replace(inputs=inputs)])
 
 
 def tabulate_mechanism(
-    plants: MechanismPlants, heights_m: Array, velocities_m_per_s: Array
+    plants: MechanismPlants, heights_m: Array, velocities_m_per_s: Array, inputs: Array
 ) -> LinearisedMechanism:
     """The mechanism along heights without gaps and their rates, shape (N, struts).
+
+    `inputs` is the input vector there, shape (N, inputs).
 
     Raises:
         InputError: The joints cannot reach the heights.
     """
     plant = plants.plain
-    q = np.array(plant.init(heights_m[0].tolist()).positions)
+    first = plant.init(heights_m[0].tolist(), inputs=inputs[0].tolist())
+    q, v = np.array(first.positions), np.zeros(plant.coordinates)
+    free = plant.free
     entries: list[LinearisedMechanism] = []
-    for height, velocity in zip(heights_m, velocities_m_per_s, strict=True):
+    for height, velocity, given in zip(heights_m, velocities_m_per_s, inputs, strict=True):
+        q, v = q.copy(), v.copy()
+        plant.put_moved(q, v, given)
         for _ in range(20):
             jacobians = plant.jacobians(q)
             error = height - jacobians.offsets_m - jacobians.struts @ q
-            q = q + np.linalg.lstsq(jacobians.struts, error, rcond=None)[0]
+            q[free] += np.linalg.lstsq(jacobians.struts[:, free], error, rcond=None)[0]
             if float(np.max(np.abs(error))) < _REACHED_M:
                 break
-        v = np.linalg.lstsq(plant.jacobians(q).struts, velocity, rcond=None)[0]
+        struts = plant.jacobians(q).struts
+        v[free] = 0.0
+        v[free] = np.linalg.lstsq(struts[:, free], velocity - struts @ v, rcond=None)[0]
         entries.append(_mechanism_at(plants, q, v))
     return _stack(entries)
 
@@ -180,17 +232,20 @@ def _mechanism_at(plants: MechanismPlants, q: Array, v: Array) -> LinearisedMech
     bias_q, bias_v = plain.bias_slopes(q, v)
     heavier = [plant.mechanics(q, v) for plant in plants.heavier]
     return LinearisedMechanism(
-        q,
-        v,
+        q[plain.free],
+        v[plain.free],
         here.heights_m,
+        plain.jacobians(q).struts @ v,
         here.struts,
-        here.applied,
+        here.inputs,
+        here.moved,
         here.mass,
         here.bias,
         bias_q,
         bias_v,
         np.array([other.mass - here.mass for other in heavier]),
         np.array([other.bias - here.bias for other in heavier]),
+        np.array([other.inputs - here.inputs for other in heavier]),
     )
 
 

@@ -70,7 +70,7 @@ def dart_heights(
     plant = DartPlant(spec_with_corrections(problem, model))
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
-    states = _plant_states(problem, model, start[2 * plant.coordinates :], plant)
+    states = _plant_states(problem, model, start[2 * plant.free_coordinates :], plant)
     steps = 2 if run.substeps == 1 else 2 * run.substeps
     while steps < _MOST_STEPS and 2 * steps * nodes <= _MOST_STEPS_IN_ALL:
         heights_m = _simulate_heights(plant, run, (states, start), count, steps)
@@ -103,13 +103,14 @@ def _simulate_heights(
     """Heights (count, struts) at the first nodes; `begin`: internal states, initial vector."""
     states, start = begin
     grid = run.grid
-    n = plant.coordinates
-    state = plant.state(
-        tuple(start[:n].tolist()), tuple(start[n : 2 * n].tolist()), states, float(grid.t_s[0])
-    )
+    n, inputs = plant.free_coordinates, _interpolate_inputs(run, count, steps)
+    q, v = np.zeros((2, plant.coordinates))
+    q[plant.free], v[plant.free] = start[:n], start[n : 2 * n]
+    plant.put_moved(q, v, inputs[0])
+    state = plant.state(q.tolist(), v.tolist(), states, float(grid.t_s[0]))
+    drive = inputs.tolist()
     no_forces = (0.0,) * len(plant.spec.struts)
     heights = np.empty((count, len(no_forces)))
-    applied = _interpolate_force(run, count, steps).tolist()
     lengths = (np.diff(grid.t_s[:count]) / steps).tolist()
     temperature = grid.temperature_c.tolist()
     for k in range(count):
@@ -117,14 +118,14 @@ def _simulate_heights(
         if k + 1 == count:
             break
         for step in range(steps):
-            loaded = plant.load(state, no_forces, applied[steps * k + step], temperature[k])
-            state = plant.step(loaded, lengths[k], applied[steps * k + step + 1])
+            loaded = plant.load(state, no_forces, drive[steps * k + step], temperature[k])
+            state = plant.step(loaded, lengths[k], drive[steps * k + step + 1])
     return heights
 
 
-def _interpolate_force(run: DrivenRun, count: int, steps: int) -> Array:
-    """Applied force at `steps` points between nodes, shape (steps * (count - 1) + 1,)."""
+def _interpolate_inputs(run: DrivenRun, count: int, steps: int) -> Array:
+    """Input vector at `steps` points between nodes, shape (steps * (count - 1) + 1, inputs)."""
     parts = 2 * run.substeps
-    fine = run.fine_n[: parts * (count - 1) + 1]
+    fine = run.fine[: parts * (count - 1) + 1]
     at = np.linspace(0.0, count - 1.0, len(fine))
     return CubicSpline(at, fine)(np.linspace(0.0, count - 1.0, steps * (count - 1) + 1))

@@ -134,7 +134,6 @@ class PrescribedProblem(Problem):
     """A model and recordings of a dyno; `noise_n`: deviation of each cell's residual, (struts,)."""
 
     bench: ClassVar[Bench] = "motion_given"
-    assumption: ClassVar[str] = "The motion is smoothed over the whole recording."
     runs: tuple[DynoRun, ...]
     noise_n: Array
 
@@ -155,6 +154,10 @@ class PrescribedProblem(Problem):
         for run in runs:
             _check_channels(run, track.strut_forces(problem, base, run.along, start))
         return problem
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        return ("The motion is smoothed over the whole recording.",)
 
     @property
     def grids(self) -> tuple[RecordingGrid, ...]:

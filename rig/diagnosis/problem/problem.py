@@ -43,6 +43,7 @@ class LinearParameter(NamedTuple):
             from which laws are taken, its share in the linear spring's force counts as preload.
         deviation: Standard deviation of the prior on its change.
         least: Lowest change; mass stays positive, no spring or damper turns negative.
+        input: Of a gain, the index in the input vector of what it is the gain of.
     """
 
     strut: int
@@ -50,6 +51,7 @@ class LinearParameter(NamedTuple):
     nominal: float
     deviation: float
     least: float
+    input: int = -1
 
 
 class ExistingParameters(NamedTuple):
@@ -181,14 +183,9 @@ class ProblemBasis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem(ABC):
-    """A model held against recordings; fields as in `ProblemBasis`.
-
-    Attributes:
-        assumption: Note of a diagnosis: what the bench's residual takes for granted.
-    """
+    """A model held against recordings; fields as in `ProblemBasis`."""
 
     bench: ClassVar[Bench]
-    assumption: ClassVar[str]
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[ExistingParameters, ...]
@@ -204,6 +201,11 @@ class Problem(ABC):
         Raises:
             RecordingError: A channel cannot be what its name says.
         """
+
+    @property
+    @abstractmethod
+    def assumptions(self) -> tuple[str, ...]:
+        """Notes of a diagnosis: what the bench's residual takes for granted."""
 
     @property
     @abstractmethod

@@ -1,0 +1,133 @@
+"""What drives the model of a bench, as it was measured: samples in, the model's input vector out.
+
+A force or torque acts as it was last measured. A body that is moved is followed by a filter
+(`rig.bridge.tracked_motion`) and is where the filter predicts it for the tick.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from rig.bridge.measurement_age import age_limit_ns
+from rig.bridge.tracked_motion import (
+    SETTLED,
+    TrackedMotion,
+    accelerate,
+    predict_motion,
+    update_motion,
+    update_with_acceleration,
+)
+from rig.channels.channel import Channel, Sample
+
+StateT = TypeVar("StateT")
+
+_LONGEST_GAP = 10
+"""Intervals after which a motion is followed from the next position on, as from the first."""
+
+
+class MeasuredInput(Protocol[StateT]):
+    """An input of the model. Its states are frozen; None stands for nothing measured."""
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """Channels that measure it; empty where nothing does, and the input is zero."""
+        ...
+
+    def update(self, state: StateT | None, sample: Sample) -> StateT | None:
+        """State after a sample of one of its channels."""
+        ...
+
+    def values(self, state: StateT | None, t_ns: int) -> tuple[float, ...]:
+        """Its part of the input vector at a time (see `dart_model.plant.inputs`)."""
+        ...
+
+    def measured_ns(self, state: StateT) -> int:
+        """Time of its newest sample."""
+        ...
+
+    def is_ready(self, state: StateT | None) -> bool:
+        """Whether a model can start with it."""
+        ...
+
+
+AnyInput = MeasuredInput[Any]
+"""An input of whatever kind: its states come from it alone and go back to it alone."""
+
+
+@dataclass(frozen=True)
+class HeldInput:
+    """A force (N) or torque (N·m); `channel` is None where it is not measured."""
+
+    channel: Channel | None
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        return () if self.channel is None else (self.channel,)
+
+    def update(self, state: Sample | None, sample: Sample) -> Sample:
+        del state
+        return sample
+
+    def values(self, state: Sample | None, t_ns: int) -> tuple[float]:
+        del t_ns
+        return (0.0,) if state is None else (state.value,)
+
+    def measured_ns(self, state: Sample) -> int:
+        return state.t_ns
+
+    def is_ready(self, state: Sample | None) -> bool:
+        return state is not None or self.channel is None
+
+
+class Followed(Struct, frozen=True, gc=False):
+    """A motion, and the time since which it is followed without a gap."""
+
+    motion: TrackedMotion
+    since_ns: int
+
+
+@dataclass(frozen=True)
+class MovedInput:
+    """Position (m), velocity (m/s) and acceleration (m/s²) of a body that is moved.
+
+    Attributes:
+        acceleration: Channel of its acceleration; None where it follows from the positions.
+        settling_s: Time constant with which older positions fade.
+    """
+
+    position: Channel
+    acceleration: Channel | None
+    settling_s: float
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        return (self.position,) if self.acceleration is None else (self.position, self.acceleration)
+
+    def update(self, state: Followed | None, sample: Sample) -> Followed | None:
+        if self.acceleration is not None and sample.channel == self.acceleration.index:
+            return state and replace(state, motion=accelerate(state.motion, sample))
+        interval_ns = self.position.interval_ns
+        if state is None or sample.t_ns - state.motion.measured_ns > _LONGEST_GAP * interval_ns:
+            return Followed(TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns), sample.t_ns)
+        update = update_motion if self.acceleration is None else update_with_acceleration
+        return replace(state, motion=update(state.motion, sample, self.settling_s))
+
+    def values(self, state: Followed | None, t_ns: int) -> tuple[float, float, float]:
+        return (0.0, 0.0, 0.0) if state is None else predict_motion(state.motion, t_ns)
+
+    def measured_ns(self, state: Followed) -> int:
+        return state.motion.measured_ns
+
+    def is_ready(self, state: Followed | None) -> bool:
+        if state is None:
+            return False
+        return state.motion.measured_ns - state.since_ns >= SETTLED * self.settling_s * 1e9
+
+
+def grace_ns(item: AnyInput, stale_after_ns: int) -> int:
+    """How much older than a height its newest sample may be: its own cycle may be longer."""
+    limits_ns = [age_limit_ns(it.interval_ns, stale_after_ns) for it in item.channels[:1]]
+    return max(limits_ns, default=stale_after_ns) - stale_after_ns

@@ -1,0 +1,83 @@
+"""A measured motion, followed by a filter with fading memory: position, velocity, acceleration.
+
+The filter has no lag for a constant acceleration. Where the acceleration itself is measured, only
+position and velocity are corrected, and there is no lag for any acceleration that the sensor shows.
+
+Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
+fading-memory polynomial filters of second and of first degree.
+"""
+
+import math
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from rig.channels.channel import Sample
+
+SETTLED = 9.0
+"""Time constants after which the filter has forgotten that it began at rest: to a hundredth."""
+
+
+class TrackedMotion(Struct, frozen=True, gc=False):
+    """A motion as it is known: a position and its derivatives at the last measurement."""
+
+    position_m: float
+    velocity_m_per_s: float
+    acceleration_m_per_s2: float
+    innovation_m: float
+    measured_ns: int
+
+
+def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
+    """The motion after a new measured position; older ones fade with a time constant."""
+    age_s = (sample.t_ns - motion.measured_ns) * 1e-9
+    if age_s <= 0.0:
+        return motion
+    position_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
+    innovation_m = sample.value - position_m
+    kept = math.exp(-age_s / settling_s)
+    fresh = 1.0 - kept
+    return TrackedMotion(
+        position_m + (1.0 - kept**3) * innovation_m,
+        velocity + 1.5 * fresh * fresh * (1.0 + kept) * innovation_m / age_s,
+        acceleration + fresh**3 * innovation_m / (age_s * age_s),
+        innovation_m,
+        sample.t_ns,
+    )
+
+
+def predict_motion(motion: TrackedMotion, t_ns: int) -> tuple[float, float, float]:
+    """Position (m), velocity (m/s) and acceleration (m/s²) at a time after the last measurement."""
+    h = (t_ns - motion.measured_ns) * 1e-9
+    acceleration = motion.acceleration_m_per_s2
+    velocity = motion.velocity_m_per_s + h * acceleration
+    return (
+        motion.position_m + h * (motion.velocity_m_per_s + 0.5 * h * acceleration),
+        velocity,
+        acceleration,
+    )
+
+
+def update_with_acceleration(
+    motion: TrackedMotion, sample: Sample, settling_s: float
+) -> TrackedMotion:
+    """The motion after a new measured position, its acceleration being that of a sensor."""
+    age_s = (sample.t_ns - motion.measured_ns) * 1e-9
+    if age_s <= 0.0:
+        return motion
+    position_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
+    innovation_m = sample.value - position_m
+    kept = math.exp(-age_s / settling_s)
+    fresh = 1.0 - kept
+    return TrackedMotion(
+        position_m + (1.0 - kept * kept) * innovation_m,
+        velocity + fresh * fresh * innovation_m / age_s,
+        acceleration,
+        innovation_m,
+        sample.t_ns,
+    )
+
+
+def accelerate(motion: TrackedMotion, sample: Sample) -> TrackedMotion:
+    """The motion after a measured acceleration, which it has from the last position on."""
+    return replace(motion, acceleration_m_per_s2=sample.value)
