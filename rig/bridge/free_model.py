@@ -17,6 +17,7 @@ from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import TEMPERATURE
+from rig.closed_loop.decoupling import Matrix, combine, combine_stds, decouple
 from rig.closed_loop.strut_response import strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
@@ -44,6 +45,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
+        decoupling: From the observers' forces to the struts', see `rig.closed_loop.decoupling`.
     """
 
     t_ns: int
@@ -57,6 +59,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
+    decoupling: Matrix = ()
 
 
 _Received = Sequence[Sample | None]
@@ -275,7 +278,8 @@ class FreeModelEstimator:
         heights, velocities = [[item[i] for item in starts] for i in (0, 1)]
         inputs = self._input_vector(state.inputs, t_ns)
         model = self._plant.init(heights, velocities, t_ns * 1e-9, inputs)
-        loaded = self._plant.load(model, (0.0,) * len(first), inputs, state.temperature_c)
+        no_forces = (0.0,) * len(first)
+        loaded = self._plant.load(model, no_forces, inputs, state.temperature_c)
         responses = strut_responses(self._plant, heights)
         observers: list[ObserverState] = []
         longest_gaps_ns: list[int] = []
@@ -305,9 +309,10 @@ class FreeModelEstimator:
             model=loaded,
             longest_gaps_ns=tuple(longest_gaps_ns),
             bands=state.bands or (InnovationBand(),) * len(first),
+            decoupling=decouple(self._plant, self.observers, heights),
         )
         started = self.unsettle(started, t_ns)
-        return self._estimate(started, loaded, self._newest_ns(state))
+        return self._estimate(started, loaded, no_forces, self._newest_ns(state))
 
     def _sample_timing(self, strut: int) -> tuple[int, int]:
         """Interval and delay of a strut's heights in ns; zero where none is measured."""
@@ -371,6 +376,7 @@ class FreeModelEstimator:
             further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
+        law_errors_n: list[float] = []
         bands: list[InnovationBand] = []
         oldest_ns = t_ns
         known = self._with_slopes(state.observers, model, inputs, temperature_c)
@@ -399,7 +405,10 @@ class FreeModelEstimator:
             bands.append(band)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
+            law_errors_n.append(observed.law_error_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
+        if state.decoupling:
+            virtual_n = self._limit(combine(state.decoupling, virtual_n, law_errors_n))
         loaded = self._plant.load(model, virtual_n, inputs, temperature_c)
         oldest_ns = self._newest_input_ns(known_inputs, oldest_ns)
         after = FreeModelState(
@@ -414,8 +423,16 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
+            state.decoupling,
         )
-        return self._estimate(after, loaded, oldest_ns)
+        return self._estimate(after, loaded, virtual_n, oldest_ns)
+
+    def _limit(self, forces_n: Sequence[float]) -> list[float]:
+        """Forces within the limits of the struts' observers."""
+        return [
+            min(max(force_n, -observer.force_limit_n), observer.force_limit_n)
+            for force_n, observer in zip(forces_n, self.observers, strict=True)
+        ]
 
     def _with_slopes(
         self,
@@ -478,32 +495,41 @@ class FreeModelEstimator:
         return innovations
 
     def _estimate(
-        self, state: FreeModelState, loaded: LoadedModel[ModelState], measured_ns: int
+        self,
+        state: FreeModelState,
+        loaded: LoadedModel[ModelState],
+        virtual_n: Sequence[float],
+        measured_ns: int,
     ) -> tuple[FreeModelState, Estimate]:
-        """State and estimate at the end of a step, after which the model is `loaded`."""
+        """State and estimate at the end of a step, after which the model is `loaded`.
+
+        `virtual_n` is the virtual force of each strut.
+        """
         struts: list[StrutOutput] = []
         left_out: tuple[int, ...] = ()
         size = sum(loaded.inputs)
-        is_calm, t_ns, longest_gaps_ns = state.is_settled, state.t_ns, state.longest_gaps_ns
+        is_calm, matrix = state.is_settled, state.decoupling
+        residuals_n = [observer.residual_force_n for observer in state.observers]
+        stds_n = [observer.force_std_n for observer in state.observers]
+        if matrix:
+            law_errors_n = [observer.law_error_n for observer in state.observers]
+            residuals_n = combine(matrix, residuals_n, law_errors_n)
+            stds_n = combine_stds(matrix, stds_n)
         for strut, observer in enumerate(state.observers):
-            if (
-                observer.is_disturbed
-                or state.bands[strut].is_left
-                or t_ns - observer.measured_ns > longest_gaps_ns[strut]
-            ):
+            if self._is_disturbed(state, strut, virtual_n[strut]):
                 is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]
-            force_n = law_force_n + observer.residual_force_n
+            force_n = law_force_n + residuals_n[strut]
             output = StrutOutput(
                 force_n,
-                observer.virtual_force_n,
+                virtual_n[strut],
                 True,
                 height_m,
                 velocity_m_per_s,
                 loaded.accelerations_m_per_s2[strut],
                 observer.innovation_m,
-                observer.force_std_n,
+                stds_n[strut],
                 law_force_n,
             )
             struts.append(output)
@@ -514,17 +540,28 @@ class FreeModelEstimator:
         # what is not finite has an acceleration of zero there.
         diverged = -1 if is_sensible(size) else find_divergence(struts)
         if not is_calm:
-            state = self._settle(state)
+            state = self._settle(state, virtual_n)
         estimate = Estimate(tuple(struts), measured_ns, state.is_settled, diverged, left_out)
         return state, estimate
 
-    def _settle(self, state: FreeModelState) -> FreeModelState:
+    def _is_disturbed(self, state: FreeModelState, strut: int, virtual_force_n: float) -> bool:
+        """Whether a strut's estimate is not what it would be had nothing ever been missing."""
+        observer = state.observers[strut]
+        return (
+            observer.is_disturbed
+            or state.bands[strut].is_left
+            or state.t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
+            or (
+                bool(state.decoupling)
+                and abs(virtual_force_n) >= self.observers[strut].force_limit_n
+            )
+        )
+
+    def _settle(self, state: FreeModelState, virtual_forces_n: Sequence[float]) -> FreeModelState:
         """State with the times of the last disturbances, and whether every strut has settled."""
         is_settled, t_ns, disturbed_ns = True, state.t_ns, list(state.disturbed_ns)
         for strut, settling_ns in enumerate(self._settling_ns):
-            observer = state.observers[strut]
-            is_old = t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-            if is_old or observer.is_disturbed or state.bands[strut].is_left:
+            if self._is_disturbed(state, strut, virtual_forces_n[strut]):
                 disturbed_ns[strut] = t_ns
                 is_settled = False
             elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:

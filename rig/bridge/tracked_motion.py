@@ -81,3 +81,29 @@ def update_with_acceleration(
 def accelerate(motion: TrackedMotion, sample: Sample) -> TrackedMotion:
     """The motion after a measured acceleration, which it has from the last position on."""
     return replace(motion, acceleration_m_per_s2=sample.value)
+
+
+def position_noise_gain(settling_s: float, interval_s: float, *, has_acceleration: bool) -> float:
+    """Standard deviation of a followed position over that of white noise in its samples.
+
+    It is that at the time of a sample, by the response to a single one.
+    """
+    update = update_with_acceleration if has_acceleration else update_motion
+    step_ns = round(interval_s * 1e9)
+    motion = update(TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), Sample(0, 1.0, step_ns), settling_s)
+    square, number = 0.0, 1
+    while True:
+        square += motion.position_m**2
+        number += 1
+        if number * interval_s > SETTLED * 2.0 * settling_s + 3.0 * interval_s:
+            return math.sqrt(square)
+        motion = update(motion, Sample(0, 0.0, number * step_ns), settling_s)
+
+
+def lag_free_hz(settling_s: float, share: float) -> float:
+    """Frequency up to which a followed position errs by at most a share of the motion.
+
+    Without a measured acceleration: the error of a filter with three poles of one time constant is
+    the cube of the angular frequency times it.
+    """
+    return share ** (1.0 / 3.0) / (2.0 * math.pi * settling_s)

@@ -12,9 +12,11 @@ from rig.cli.terminal import JsonFlag, console, print_json, print_text
 from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
+STORIES = (STORY, "quarter_car_road")
+"""Cases that tell the whole method (`rig.demo.story.STORIES`)."""
 
 EXAMPLES = (
-    "Examples: `rig demo` · `rig demo --seed 7` · "
+    "Examples: `rig demo` · `rig demo --seed 7` · `rig demo --case quarter_car_road` · "
     "`rig demo --case reference --lockstep --out /tmp/reference`"
 )
 
@@ -24,7 +26,8 @@ def demo(
         str,
         typer.Option(
             metavar="CASE",
-            help=f"{STORY} (the whole method), reference, quarter_car or dyno.",
+            help=f"The whole method: {' or '.join(STORIES)}; a run alone: reference, quarter_car "
+            "or dyno.",
         ),
     ] = STORY,
     seed: Annotated[
@@ -55,12 +58,12 @@ def demo(
     """
     from rig.demo.cases import CASES, DemoOptions, run_case
 
-    if case not in (STORY, *CASES):
-        raise InputError(f"--case {case!r}: {expected_name(case, (STORY, *CASES))}")
+    if case not in (*STORIES, *CASES):
+        raise InputError(f"--case {case!r}: {expected_name(case, (*STORIES, *CASES))}")
     out = out or free_folder(Path("rig-demo"))
     refuse_full(out)
-    if case == STORY:
-        _run_story(seed, out, lockstep=lockstep, duration_s=duration_s, as_json=as_json)
+    if case in STORIES:
+        _run_story(case, seed, out, lockstep=lockstep, duration_s=duration_s, as_json=as_json)
         return
     with stoppable() as stop, status_line(duration_s) as watch:
         result = run_case(case, out, DemoOptions(lockstep, duration_s, stop, watch))
@@ -73,7 +76,7 @@ def demo(
 
 
 def _run_story(
-    seed: int, out: Path, *, lockstep: bool, duration_s: float | None, as_json: bool
+    case: str, seed: int, out: Path, *, lockstep: bool, duration_s: float | None, as_json: bool
 ) -> None:
     from rig.demo.cases import DemoOptions
     from rig.demo.story import run_story
@@ -90,6 +93,7 @@ def _run_story(
             seed,
             out,
             DemoOptions(lockstep, duration_s, stop, watch),
+            case=case,
             chapter=chapter,
             diagnosis_progress=bar,
         )
@@ -97,11 +101,12 @@ def _run_story(
         print_json(story.summary())
         return
     print_run(story.first_run, with_timing=not lockstep)
-    print_diagnosis(story.diagnosis, struts=1)
+    print_diagnosis(story.diagnosis, struts=story.struts)
     before, after = story.virtual_force_rms_n
+    where = f" of {story.bench.strut}" if story.struts > 1 else ""
     parameters = ", ".join(f"{key} {value:.4g}" for key, value in story.effect.parameters.items())
     console.print(
-        f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
+        f"On a fresh run the virtual force{where} falls from {before:.2f} N to {after:.2f} N RMS.\n"
         f"Effect of the bench, which the diagnosis did not know: {story.effect.name} "
         f"(family {story.family}): {parameters}.\n"
         f"Report: {out}/diagnosis/report.html\n"

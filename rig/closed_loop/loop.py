@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
+from rig.closed_loop.decoupling import combine, decouple
 from rig.closed_loop.derivatives import central_differences
 from rig.closed_loop.strut_response import (
     USUAL_SPEED_M_PER_S,
     StrutResponse,
     strut_responses,
 )
-from rig.observers.protocol import AnyObserver, Innovation, Observer, Start, StateT
+from rig.observers.protocol import AnyObserver, Innovation, Observer, ObserverState, Start, StateT
 
 Array = NDArray[np.float64]
 
@@ -120,6 +121,7 @@ class Loop:
         self._no_inputs = (0.0,) * plant.inputs
         self._law_n = plant.load(start, [0.0] * plant.struts, self._no_inputs, AMBIENT_C).forces_n
         self._responses = responses or strut_responses(plant, heights_m)
+        self._decoupling = decouple(plant, observers, heights_m)
         self._states = [
             self._steady_state(observer, response)
             for observer, response in zip(self._observers, self._responses, strict=True)
@@ -175,7 +177,7 @@ class Loop:
         timing, seen = self._timing, parts[-1]
         count = len(self._observers)
         for tick in range(1, timing.measured_every + 1):
-            acting = [state.virtual_force_n for state in states]
+            acting = self._combine(states, [state.virtual_force_n for state in states])
             acting[strut] -= residual_n
             loaded = self._plant.load(model, acting, self._no_inputs, AMBIENT_C)
             model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
@@ -201,11 +203,15 @@ class Loop:
                 )
             ]
         law_n = self._plant.load(model, [0.0] * count, self._no_inputs, AMBIENT_C).forces_n[strut]
-        error_n = law_n - self._law_n[strut] + states[strut].residual_force_n - residual_n
+        residuals_n = self._combine(states, [state.residual_force_n for state in states])
+        error_n = law_n - self._law_n[strut] + residuals_n[strut] - residual_n
         numbers = [
             observer.numbers(state) for observer, state in zip(self._observers, states, strict=True)
         ]
         return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
+
+    def _combine(self, states: Sequence[ObserverState], forces_n: Sequence[float]) -> list[float]:
+        return combine(self._decoupling, forces_n, [state.law_error_n for state in states])
 
     def linear(self, strut: int = 0, speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> LinearLoop:
         """The loop about a motion at a speed, as one strut's noise and residual force drive it."""

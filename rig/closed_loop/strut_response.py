@@ -44,6 +44,21 @@ def strut_responses(plant: AnyPlant, heights_m: Sequence[float]) -> list[StrutRe
     return [_strut_response(plant, np.asarray(heights_m), index) for index in range(plant.struts)]
 
 
+def mobility_matrix(plant: AnyPlant, heights_m: Sequence[float]) -> NDArray[np.float64]:
+    """Acceleration of each strut's height per newton in each strut, in 1/kg, (struts, struts).
+
+    At rest at some heights; NaN for a strut that stands where the others put it.
+    """
+    state, no_inputs = plant.init(heights_m), (0.0,) * plant.inputs
+
+    def accelerations(forces_n: NDArray[np.float64]) -> NDArray[np.float64]:
+        loaded = plant.load(state, forces_n.tolist(), no_inputs, AMBIENT_C)
+        return np.array(loaded.accelerations_m_per_s2)
+
+    free = accelerations(np.zeros(plant.struts))
+    return np.column_stack([accelerations(unit) - free for unit in np.eye(plant.struts)])
+
+
 def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int) -> StrutResponse:
     alone, no_inputs = np.eye(plant.struts)[index], (0.0,) * plant.inputs
 

@@ -19,25 +19,66 @@ from rig.run.logged_run import Ended
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig, UndeclaredEffect
 
-_STRUT = "strut"
-_RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
-    "friction": ("friction", {"coulomb_force_n": (5.0, 15.0)}),
-    "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (1.0e5, 4.0e5)}),
-    "bump_stop": (
-        "stop",
+Ranges = Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]]
+"""Undeclared effects that may be drawn: their family, and the range of each parameter."""
+
+
+@dataclass(frozen=True)
+class StoryBench:
+    """A bench of the package with which the story is told.
+
+    Attributes:
+        configuration: Its configuration; that of the bench has `_bench` behind the name.
+        strut: Strut in which the undeclared effect acts.
+        effects: Effects that may be drawn.
+    """
+
+    configuration: str
+    strut: str
+    effects: Ranges
+
+
+STORIES: Mapping[str, StoryBench] = {
+    "story": StoryBench(
+        "story",
+        "strut",
         {
-            "contact_height_m": (0.405, 0.415),
-            "contact_stiffness_n_per_m1_5": (5.0e4, 2.0e5),
-            "dissipation_s_per_m": (0.0, 0.3),
+            "friction": ("friction", {"coulomb_force_n": (5.0, 15.0)}),
+            "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (1.0e5, 4.0e5)}),
+            "bump_stop": (
+                "stop",
+                {
+                    "contact_height_m": (0.405, 0.415),
+                    "contact_stiffness_n_per_m1_5": (5.0e4, 2.0e5),
+                    "dissipation_s_per_m": (0.0, 0.3),
+                },
+            ),
+            "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (60.0, 200.0)}),
+            "preload": ("preload", {"force_n": (5.0, 20.0)}),
+            "added_mass": ("inertia", {"mass_kg": (0.5, 2.0)}),
+            "linear_damping": ("damping", {"damping_n_s_per_m": (20.0, 60.0)}),
+            "linear_stiffness": ("stiffness", {"stiffness_n_per_m": (100.0, 300.0)}),
         },
     ),
-    "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (60.0, 200.0)}),
-    "preload": ("preload", {"force_n": (5.0, 20.0)}),
-    "added_mass": ("inertia", {"mass_kg": (0.5, 2.0)}),
-    "linear_damping": ("damping", {"damping_n_s_per_m": (20.0, 60.0)}),
-    "linear_stiffness": ("stiffness", {"stiffness_n_per_m": (100.0, 300.0)}),
+    "quarter_car_road": StoryBench(
+        "quarter_car_road",
+        "suspension",
+        {
+            "friction": ("friction", {"coulomb_force_n": (40.0, 120.0)}),
+            "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (3.0e6, 1.0e7)}),
+            "bump_stop": (
+                "stop",
+                {
+                    "contact_height_m": (0.335, 0.342),
+                    "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
+                    "dissipation_s_per_m": (0.0, 0.3),
+                },
+            ),
+            "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (800.0, 3.0e3)}),
+        },
+    ),
 }
-"""Undeclared effects that may be drawn: their family, and the range of each parameter."""
+"""Benches by the name of their case."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +86,22 @@ class Story:
     """Result of the story.
 
     Attributes:
+        bench: The bench.
         family: Family of the undeclared effect.
         effect: The effect, as the bench names it.
         diagnosis: The diagnosis, which did not know it.
         virtual_force_rms_n: RMS of the virtual force on a fresh run, before and after.
         first_run: The run that was diagnosed.
+        struts: Number of struts of the model.
     """
 
+    bench: StoryBench
     family: str
     effect: UndeclaredEffect
     diagnosis: Diagnosis
     virtual_force_rms_n: tuple[float, float]
     first_run: Ended
+    struts: int
 
     def summary(self) -> dict[str, object]:
         """Figures for `summary.json`."""
@@ -69,14 +114,15 @@ class Story:
         }
 
 
-def draw_effect(seed: int) -> tuple[str, UndeclaredEffect]:
-    """Family and effect of the bench for a seed, which is not negative."""
-    random = np.random.default_rng(seed)
-    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds give different effects
-    family, ranges = _RANGES[name]
+def draw_effect(seed: int, case: str = "story") -> tuple[str, UndeclaredEffect]:
+    """Family and effect of a case's bench for a seed, which is not negative."""
+    bench, random = STORIES[case], np.random.default_rng(seed)
+    # So that neighbouring seeds give different effects.
+    name = list(bench.effects)[seed % len(bench.effects)]
+    family, ranges = bench.effects[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
     return family, UndeclaredEffect.model_validate(
-        {"name": name, "strut": _STRUT, "parameters": parameters}
+        {"name": name, "strut": bench.strut, "parameters": parameters}
     )
 
 
@@ -85,6 +131,7 @@ def run_story(
     folder: Path,
     options: DemoOptions,
     *,
+    case: str = "story",
     chapter: Callable[[str], None],
     diagnosis_progress: Callable[[str, float], None],
 ) -> Story:
@@ -97,15 +144,17 @@ def run_story(
         seed: Draws the effect.
         folder: Where to write; absent or empty.
         options: How to run it; all runs but the first one are in lockstep in any case.
+        case: Bench with which it is told, one of `STORIES`.
         chapter: Called with the next part of the story.
         diagnosis_progress: Called with the stage of the diagnosis and the share that is done.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    family, effect = draw_effect(seed)
-    plan = load_plan(CONFIGS / "story.yaml", duration_s=options.duration_s)
-    benches = [_bench(effect, excitation) for excitation in (1, 2, 3)]
+    bench = STORIES[case]
+    family, effect = draw_effect(seed, case)
+    plan = load_plan(CONFIGS / f"{bench.configuration}.yaml", duration_s=options.duration_s)
+    benches = [_bench(bench, effect, excitation) for excitation in (1, 2, 3)]
 
     chapter("The bridge runs with a bench that has an undeclared effect")
     first = options.run(plan, benches[0], folder / "run", lockstep=options.lockstep)
@@ -120,32 +169,33 @@ def run_story(
     corrected = plan.with_model(load_model(out / CORRECTED_FILE))
     after = options.run(corrected, benches[2], folder / "fresh_after", lockstep=True)
     story = Story(
+        bench,
         family,
         effect,
         result.diagnosis,
-        (_virtual_force_rms_n(before), _virtual_force_rms_n(after)),
+        (_virtual_force_rms_n(before, bench.strut), _virtual_force_rms_n(after, bench.strut)),
         first,
+        len(plan.struts),
     )
     (folder / "summary.json").write_text(json.dumps(story.summary(), indent=2) + "\n", "utf-8")
     return story
 
 
-def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
-    bench = load_bench_config(CONFIGS / "story_bench.yaml")
-    components = tuple(
-        component.model_copy(update={"seed": excitation})
-        for component in bench.applied_force.components
-    )
-    return bench.model_copy(
-        update={
-            "undeclared_effects": (effect,),
-            "seed": excitation,
-            "applied_force": bench.applied_force.model_copy(update={"components": components}),
-        }
-    )
+def _bench(story: StoryBench, effect: UndeclaredEffect, excitation: int) -> BenchConfig:
+    """The bench with an effect, and with an excitation that a number draws."""
+    bench = load_bench_config(CONFIGS / f"{story.configuration}_bench.yaml")
+    update: dict[str, object] = {"undeclared_effects": (effect,), "seed": excitation}
+    for key in ("applied_force", "prescribed_motion"):
+        drive = getattr(bench, key)
+        if drive is not None:
+            components = tuple(
+                component.model_copy(update={"seed": excitation}) for component in drive.components
+            )
+            update[key] = drive.model_copy(update={"components": components})
+    return bench.model_copy(update=update)
 
 
-def _virtual_force_rms_n(ended: Ended) -> float:
+def _virtual_force_rms_n(ended: Ended, strut: str) -> float:
     run = open_run(ended.folder)
-    force = run.columns[f"{_STRUT}.virtual_force_n"][run.t_s >= SETTLED_NS * 1e-9]
+    force = run.columns[f"{strut}.virtual_force_n"][run.t_s >= SETTLED_NS * 1e-9]
     return float(np.sqrt(np.mean(force**2)))

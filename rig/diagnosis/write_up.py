@@ -406,7 +406,8 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "Several effects act together: fewer than 95 % of such intervals contain the true "
             "value. The diagnosis of another run shows by how much the values differ."
         )
-    if any(p.kind == "mass" for p in _free(problem, search.chosen.fit)) and not search.gain_alike:
+    has_mass = any(p.kind == "mass" for p in _free(problem, search.chosen.fit))
+    if has_mass and problem.is_driven_by_force and not search.gain_alike:
         notes.append(
             "The intervals assume that the scale of the applied force is right: where that is "
             "wrong by 1 %, masses, stiffnesses, damping and forces are, too."

@@ -42,6 +42,7 @@ _NAVIGATION: dict[str, tuple[str, ...]] = {
         "how-to/adapter",
         "how-to/canopen-j1939",
         "how-to/several-struts",
+        "how-to/inputs",
         "how-to/several-sensors",
         "how-to/tune",
         "how-to/supervise",

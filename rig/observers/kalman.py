@@ -79,6 +79,7 @@ class KalmanState(Struct, frozen=True, gc=False):
     measured_ns: int
     fusion: FusionMemory | None = None
     is_disturbed: bool = False
+    law_error_n: float = 0.0
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -98,6 +99,7 @@ class KalmanObserver:
 
     requires_height: ClassVar[bool] = True
     fuses_sensors: ClassVar[bool] = True
+    asks_for_acceleration: ClassVar[bool] = True
     knows_std: ClassVar[bool] = True
 
     kind: Literal["kalman"]
@@ -150,11 +152,20 @@ class KalmanObserver:
         force_n = min(max(required / mobility_per_kg, -limit_n), limit_n)
         std_n = follower.residual_std(error, t_ns) / mobility_per_kg
         residual_n = follower.residual(error, mean) / mobility_per_kg
+        law_error_n = a / mobility_per_kg - residual_n
         error = follower.with_input(error, t_ns, -force_n * mobility_per_kg)
         measured_ns = error.t_ns if fusion is None else fusion.measured_ns
         is_disturbed = abs(force_n) >= limit_n or not follower.is_steady(error, t_ns)
         return KalmanState(
-            error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion, is_disturbed
+            error,
+            innovation_m,
+            force_n,
+            residual_n,
+            std_n,
+            measured_ns,
+            fusion,
+            is_disturbed,
+            law_error_n,
         )
 
     def with_slopes(
@@ -180,8 +191,12 @@ class KalmanObserver:
 
     def with_numbers(self, state: KalmanState, numbers: Sequence[float]) -> KalmanState:
         error = self.filter.with_numbers(state.error, numbers)
-        virtual_force_n = -error.inputs[-1][1] / error.start.mobility_per_kg
-        return structs.replace(state, error=error, virtual_force_n=virtual_force_n)
+        now_ns, by_force = error.inputs[-1]
+        mean, per_kg = self.filter.predict(error, now_ns), error.start.mobility_per_kg
+        law_error_n = (mean[2] - self.filter.residual(error, mean)) / per_kg
+        return structs.replace(
+            state, error=error, virtual_force_n=-by_force / per_kg, law_error_n=law_error_n
+        )
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one has the same filter, whose state it continues."""

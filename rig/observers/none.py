@@ -23,6 +23,7 @@ class NoState(Struct, frozen=True, gc=False):
     innovation_m: float = nan
     virtual_force_n: float = 0.0
     residual_force_n: float = 0.0
+    law_error_n: float = 0.0
     force_std_n: float = nan
     left_out: tuple[int, ...] = ()
     is_disturbed: bool = False
@@ -38,9 +39,15 @@ class NoObserver:
 
     requires_height: ClassVar[bool] = False
     fuses_sensors: ClassVar[bool] = False
+    asks_for_acceleration: ClassVar[bool] = False
     knows_std: ClassVar[bool] = False
 
     kind: Literal["none"]
+
+    @property
+    def force_limit_n(self) -> float:
+        """Zero: it has no virtual force."""
+        return 0.0
 
     @property
     def measurements_to_start(self) -> int:

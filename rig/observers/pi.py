@@ -75,6 +75,10 @@ class PiState(Struct, frozen=True, gc=False):
         return self.virtual_force_n
 
     @property
+    def law_error_n(self) -> float:
+        return 0.0
+
+    @property
     def force_std_n(self) -> float:
         return nan
 
@@ -100,6 +104,7 @@ class PiObserver:
 
     requires_height: ClassVar[bool] = True
     fuses_sensors: ClassVar[bool] = False
+    asks_for_acceleration: ClassVar[bool] = False
     knows_std: ClassVar[bool] = False
 
     kind: Literal["pi"] = "pi"

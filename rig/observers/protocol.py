@@ -69,6 +69,15 @@ class ObserverState(Protocol):
         ...
 
     @property
+    def law_error_n(self) -> float:
+        """Force by which the model's law errs because the model is not where the bench is.
+
+        Stiffness times the estimated error of the height and damping times that of its rate; 0
+        where the observer does not estimate them.
+        """
+        ...
+
+    @property
     def force_std_n(self) -> float:
         """Standard deviation of that estimate; NaN where the observer does not know it."""
         ...
@@ -117,16 +126,24 @@ class Observer(Protocol[StateT]):
     `kind`, which `rig.observers.OBSERVERS` lists.
 
     Attributes:
+        asks_for_acceleration: Whether its forces stand for accelerations of its height, so that
+            those of several struts have to be decoupled (`rig.closed_loop.decoupling`).
         knows_std: Whether it knows the standard deviation of its estimate.
     """
 
     requires_height: ClassVar[bool]
     fuses_sensors: ClassVar[bool]
+    asks_for_acceleration: ClassVar[bool]
     knows_std: ClassVar[bool]
 
     @property
     def kind(self) -> str:
         """Its name in a configuration."""
+        ...
+
+    @property
+    def force_limit_n(self) -> float:
+        """Largest magnitude of the virtual force."""
         ...
 
     @property

@@ -15,6 +15,7 @@ from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.measurement_age import age_limit_ns
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
+from rig.bridge.tracked_motion import lag_free_hz, position_noise_gain
 from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_interface
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
@@ -28,7 +29,7 @@ from rig.closed_loop.strut_response import (
 )
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
-from rig.plan.plan import Plan, vital_channels
+from rig.plan.plan import Plan, PlannedInput, vital_channels
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
@@ -283,6 +284,9 @@ def _sample_times(channel: Channel) -> Finding:
     return Finding(Severity.OK, f"sample times of {message.name}", text)
 
 
+_LAG_SHARE = 1e-3
+"""Share of a motion that counts as its error by the filter's lag: 10 µm of a centimetre."""
+
 _LONG_STALE_NS, _LONG_STALE_CYCLES = 1_000_000_000, 20
 """Time and cycles beyond which a missing measurement is noticed late, whatever the bench."""
 
@@ -310,11 +314,14 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
 
 
 def _inputs(plan: Plan) -> list[Finding]:
-    """When an input counts as missing."""
+    """When an input counts as missing, and what the filter of a motion makes of it."""
     findings: list[Finding] = []
-    for channel in (item.channel for item in plan.inputs):
+    for item in plan.inputs:
+        channel = item.channel
         if channel is None:
             continue
+        if item.is_motion:
+            findings.append(_followed_motion(item, channel))
         stale_ns = plan.config.supervision.stale_after_ns
         limit_ns = age_limit_ns(channel.interval_ns, stale_ns)
         text = f"missing after {limit_ns * 1e-6:g} ms"
@@ -325,6 +332,24 @@ def _inputs(plan: Plan) -> list[Finding]:
             severity = Severity.WARNING
         findings.append(Finding(severity, channel.key, text))
     return findings
+
+
+def _followed_motion(item: PlannedInput, channel: Channel) -> Finding:
+    """Error that the filter of a motion adds to the height of a strut on the moved body."""
+    has_acceleration = item.acceleration is not None
+    gain = position_noise_gain(
+        item.settling_s, channel.interval_ns * 1e-9, has_acceleration=has_acceleration
+    )
+    text = (
+        f"followed within {item.settling_s * 1e3:g} ms: heights above it gain {gain:.2g} times the "
+        "noise of its position"
+    )
+    if not has_acceleration:
+        text += (
+            f", and at most {_LAG_SHARE:.1%} of the motion up to "
+            f"{lag_free_hz(item.settling_s, _LAG_SHARE):.2g} Hz: settling_s is the compromise"
+        )
+    return Finding(Severity.OK, f"motion of {item.name}", text)
 
 
 def _switches(plan: Plan) -> list[Finding]:

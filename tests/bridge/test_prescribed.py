@@ -15,7 +15,15 @@ from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
 from rig.bridge.mode_supervisor import Supervision, Supervisor
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator, PrescribedMotionState
-from rig.bridge.tracked_motion import TrackedMotion, predict_motion, update_motion
+from rig.bridge.tracked_motion import (
+    TrackedMotion,
+    accelerate,
+    lag_free_hz,
+    position_noise_gain,
+    predict_motion,
+    update_motion,
+    update_with_acceleration,
+)
 from rig.bridge.values import Mode, Request, StepInput
 from rig.channels.channel import Channel, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
@@ -478,3 +486,43 @@ def test_the_filters_gains_are_those_of_a_triple_pole(interval_ms: int) -> None:
     assert after.velocity_m_per_s == pytest.approx(velocity)
     assert after.acceleration_m_per_s2 == pytest.approx((1.0 - pole) ** 3 / interval_s**2)
     assert after.innovation_m == 1.0
+
+
+# --- The filter's error, as the check reports it -------------------------------------------------
+
+
+@pytest.mark.parametrize("settling_s", [0.0015, 0.004])
+@pytest.mark.parametrize("has_acceleration", [False, True])
+def test_noise_of_positions_is_passed_on_as_reported(settling_s, has_acceleration):
+    update = update_with_acceleration if has_acceleration else update_motion
+    noise = np.random.default_rng(3).standard_normal(20_000)
+    motion, passed = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), []
+    for number, value in enumerate(noise.tolist(), start=1):
+        motion = update(motion, Sample(0, value, number * TICK_NS), settling_s)
+        passed.append(motion.position_m)
+    reported = position_noise_gain(settling_s, 1e-3, has_acceleration=has_acceleration)
+    assert np.std(passed[100:]) == pytest.approx(reported, rel=0.02)
+
+
+@pytest.mark.parametrize("settling_s", [0.0015, 0.004])
+def test_up_to_the_reported_frequency_the_lag_is_below_the_share(settling_s):
+    omega = 2.0 * np.pi * lag_free_hz(settling_s, 1e-3)
+    motion, errors = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), []
+    for number in range(1, 4000):
+        truth = math.sin(omega * number * 1e-3)
+        motion = update_motion(motion, Sample(0, truth, number * TICK_NS), settling_s)
+        errors.append(abs(motion.position_m - truth))
+    assert 2e-4 < max(errors[1000:]) < 1e-3
+
+
+def test_a_measured_acceleration_leaves_no_lag():
+    """The position is a cubic: its acceleration is not constant."""
+    motion = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
+    for number in range(1, 400):
+        t_s = number * 1e-3
+        motion = update_with_acceleration(motion, Sample(0, t_s**3, number * TICK_NS), 0.002)
+        motion = accelerate(motion, Sample(1, 6.0 * t_s, number * TICK_NS))
+    position_m, velocity, acceleration = predict_motion(motion, 400 * TICK_NS)
+    assert position_m == pytest.approx(0.4**3, abs=2e-8)
+    assert velocity == pytest.approx(3.0 * 0.4**2, abs=4e-3)
+    assert acceleration == pytest.approx(6.0 * 0.399)

@@ -90,6 +90,7 @@ def test_urgent_messages_win_arbitration(rig: Database) -> None:
     assert list(dict.fromkeys(kinds)) == [
         "BENCH_MEASUREMENT",
         "DYNO_MEASUREMENT",
+        "BENCH_ROAD",
         "RIG_ESTIMATE",
         "RIG_KINEMATICS",
         "RIG_UNCERTAINTY",

@@ -83,6 +83,7 @@ class Held(NamedTuple):
     virtual_force_n: float
     measured_ns: int
     force_std_n: float = float("nan")
+    law_error_n: float = 0.0
     left_out: tuple = ()
     is_disturbed: bool = False
 
@@ -97,7 +98,8 @@ class Proportional:
 
     measurements_to_start = 1
     requires_height = True
-    fuses_sensors = knows_std = False
+    fuses_sensors = knows_std = asks_for_acceleration = False
+    force_limit_n = 1e4
 
     def init(self, start):
         return Held(0.0, 0.0, start.t_ns)

@@ -113,6 +113,10 @@ class FreeRunProblem(Problem):
             )
         return tuple(notes)
 
+    @property
+    def is_driven_by_force(self) -> bool:
+        return self.runs[0].drive.has_force
+
     def _scale_body(self) -> str:
         """Body whose mass sets the scale: that of the strut without a correction of its mass."""
         corrected = {item.strut for item in self.linear if item.kind == "mass"}

@@ -208,6 +208,11 @@ class Problem(ABC):
         """Notes of a diagnosis: what the bench's residual takes for granted."""
 
     @property
+    def is_driven_by_force(self) -> bool:
+        """Whether the scale of what drives the bench is that of its forces and masses."""
+        return False
+
+    @property
     @abstractmethod
     def grids(self) -> tuple[RecordingGrid, ...]:
         """Nodes of each recording."""
