@@ -203,9 +203,9 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
 
 
 def _cycle_of_applied_force_ms(plan: "Plan") -> float:
-    """Cycle of the applied force's message; 0 without one."""
-    cycles = [item.channel.interval_ns for item in plan.inputs if item.channel is not None]
-    return 1e-6 * max(cycles, default=0)
+    """Longest cycle of a message with a force or torque that drives the bench; 0 without one."""
+    driving = (item.channel for item in plan.inputs if not item.is_motion)
+    return 1e-6 * max((it.interval_ns for it in driving if it is not None), default=0)
 
 
 def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> None:
@@ -272,6 +272,8 @@ def _print_latency(latency: "Latency", force_cycle_ms: float, *, is_set: bool) -
             "Latency of the height: cannot be determined from this run; it contains a single "
             "frequency, or too little that the observer follows. Record a sweep or a multisine."
         )
+    elif high_ms < 0.0 and not force_cycle_ms:
+        print_text("Latency of the height: none.")
     elif high_ms < 0.0:
         print_text(
             f"Latency of the height: none. In the loop, the applied force acts {-value_ms:.3g} ms "

@@ -6,7 +6,7 @@ over that mass, smoothed as in a diagnosis, which also finds the sensor's noise.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
+from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.closed_loop.poles import OperatingPoint
 from rig.closed_loop.strut_response import USUAL_SPEED_M_PER_S
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
@@ -39,6 +40,9 @@ and samples between which a speed is taken."""
 _LINES = 120
 """Frequencies into which a spectrum is gathered."""
 
+_SINGULAR = 1e-9
+"""Share of the largest singular value of the mobilities below which struts are not independent."""
+
 
 class FollowedStretch(NamedTuple):
     """A stretch of a run, as the observer of one strut saw it.
@@ -51,8 +55,7 @@ class FollowedStretch(NamedTuple):
         law_force_n: Force of the model's law at them, shape (M,).
         height_m: Model heights at them, shape (M,).
         velocity_m_per_s: Model velocities at them, shape (M,).
-        applied_n: Applied force with which the model was computed at them, shape (M,); zero where
-            none is known.
+        applied_n: First force that drove the model at them, shape (M,); zero where none is known.
     """
 
     t_s: Array
@@ -84,12 +87,12 @@ class Expectation(NamedTuple):
 
 
 def longest_stretch(
-    steps: pa.Table, folder: Path, strut: str, mobility_per_kg: float
+    steps: pa.Table, folder: Path, strut: str, mobilities_per_kg: Mapping[str, float]
 ) -> FollowedStretch:
     """The longest stretch of a run in which the observer followed its bench.
 
-    The steps are an Arrow table; the folder names the run in an error. The mobility is the
-    acceleration of the strut's height per newton in it.
+    The steps are an Arrow table; the folder names the run in an error. The mobilities are the
+    acceleration of the strut's height per newton in each strut.
 
     Raises:
         InputError: It has no such strut, or is too short.
@@ -105,7 +108,9 @@ def longest_stretch(
     tick_s = column("t_ns")[stretch] * 1e-9
     stretch = slice(stretch.start, stretch.start + int(np.sum(tick_s <= tick_s[:1] + _LONGEST_S)))
     tick_s = column("t_ns")[stretch] * 1e-9
-    virtual_n = column(f"{strut}.virtual_force_n")[stretch]
+    by_virtual_forces = np.zeros(len(tick_s))
+    for name, per_kg in mobilities_per_kg.items():
+        by_virtual_forces += per_kg * column(f"{name}.virtual_force_n")[stretch]
     measured_s = column(f"{strut}.measured_t_ns")[stretch] * 1e-9
     innovation_m = column(f"{strut}.innovation_m")[stretch]
     fresh = np.isfinite(measured_s) & (measured_s >= tick_s[:1])
@@ -115,10 +120,11 @@ def longest_stretch(
             f"of RUNNING without a break, expected {FEWEST} in {_SHORTEST_S:g} s"
         )
     t_s = measured_s[fresh]
-    free_m = free_error(tick_s, -virtual_n * mobility_per_kg, t_s, innovation_m[fresh])
+    free_m = free_error(tick_s, -by_virtual_forces, t_s, innovation_m[fresh])
     law = ("law_force_n", "height_m", "velocity_m_per_s")
     law_n, height_m, velocity = (column(f"{strut}.{name}")[stretch] for name in law)
-    applied_n = np.nan_to_num(column("applied_force_n")[stretch])
+    forces = [name for name in steps.schema.names if name.startswith(APPLIED_FORCE.column)]
+    applied_n = np.nan_to_num(column(forces[0])[stretch]) if forces else np.zeros(len(tick_s))
     return FollowedStretch(t_s, free_m, tick_s, law_n, height_m, velocity, applied_n)
 
 
@@ -169,19 +175,43 @@ def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> tuple[fl
     return float(np.sqrt(noise.variance)), smoothed.states[:, 2] / mobility_per_kg
 
 
-def expectation_from_run(
-    steps: pa.Table, folder: Path, strut: str, mobility_per_kg: float
-) -> Expectation:
-    """Expectation of a strut from the steps of a run of its bench, which the folder names.
+def expectations_from_run(
+    steps: pa.Table, folder: Path, struts: Sequence[str], mobility_per_kg: Array
+) -> list[Expectation]:
+    """Expectation of each strut from the steps of a run of its bench, which the folder names.
+
+    A residual force in one strut accelerates the heights of all that share a body with it: the
+    forces are those that together explain the accelerations of all heights.
+
+    Args:
+        steps: Steps as an Arrow table.
+        folder: Folder of the run.
+        struts: Names of the struts.
+        mobility_per_kg: Acceleration of each height per newton in each strut, (struts, struts).
 
     Raises:
         InputError: It has no such strut, or is too short.
     """
-    stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
-    noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
-    by_late_n = part_by_late_force(stretch, force_n)
-    source = f"{folder}, its longest stretch in RUNNING, {np.ptp(stretch.tick_s):.3g} s"
-    return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), source, by_late_n)
+    stretches: list[FollowedStretch] = []
+    noises: list[float] = []
+    accelerations: list[Array] = []
+    for strut, row in zip(struts, mobility_per_kg.tolist(), strict=True):
+        stretches.append(longest_stretch(steps, folder, strut, dict(zip(struts, row, strict=True))))
+        noise_std_m, acceleration = residual_force(stretches[-1], 1.0)
+        noises.append(noise_std_m)
+        accelerations.append(acceleration)
+    inverse = np.linalg.pinv(mobility_per_kg, rcond=_SINGULAR)
+    found: list[Expectation] = []
+    for stretch, noise_std_m, row in zip(stretches, noises, inverse, strict=True):
+        t_s = stretch.t_s
+        force_n = np.zeros(len(t_s))
+        for share, other, acceleration in zip(row.tolist(), stretches, accelerations, strict=True):
+            if share:
+                force_n += share * np.interp(t_s, other.t_s, acceleration)
+        source = f"{folder}, its longest stretch in RUNNING, {np.ptp(stretch.tick_s):.3g} s"
+        by_late_n = part_by_late_force(stretch, force_n)
+        found.append(Expectation(noise_std_m, *spectrum(t_s, force_n), source, by_late_n))
+    return found
 
 
 def part_by_late_force(stretch: FollowedStretch, force_n: Array) -> float:

@@ -14,7 +14,7 @@ interval is infinite then.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -106,15 +106,15 @@ def estimate_latency(
     folder: Path,
     plan: Plan,
     strut: str,
-    mobility_per_kg: float,
+    mobilities_per_kg: Mapping[str, float],
     observer_for: Callable[[float], KalmanObserver],
     progress: Callable[[float], None],
 ) -> Latency:
     """The delay of a strut's height.
 
-    The mobility is the acceleration of its height per newton in it. `observer_for` gives a
-    noise-aware observer whose loop is stable with a delay; `progress` is called with the share that
-    is done.
+    The mobilities are the acceleration of its height per newton in each strut. `observer_for`
+    gives a noise-aware observer whose loop is stable with a delay; `progress` is called with the
+    share that is done.
 
     Raises:
         InputError: The run is damaged or too short.
@@ -123,8 +123,8 @@ def estimate_latency(
     def series(delay_s: float, observer: KalmanObserver) -> _Series:
         delayed = with_delay(plan.with_observers({strut: observer}), delay_s)
         steps = replay(folder, plan=delayed).steps
-        stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
-        _, residual_n = residual_force(stretch, mobility_per_kg)
+        stretch = longest_stretch(steps, folder, strut, mobilities_per_kg)
+        _, residual_n = residual_force(stretch, mobilities_per_kg[strut])
         is_settled = stretch.t_s > stretch.tick_s[0] + _SETTLED_S
         is_used = is_settled & (stretch.t_s <= stretch.tick_s[-1])
         t_s = stretch.t_s[is_used]

@@ -20,6 +20,7 @@ from rig.closed_loop.poles import OperatingPoint
 from rig.closed_loop.strut_response import (
     FAST_SPEED_M_PER_S,
     StrutResponse,
+    mobility_matrix,
     strut_responses,
 )
 from rig.diagnosis.progress import Progress, within
@@ -33,9 +34,10 @@ from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
 from rig.run.replay import replay
 from rig.tuning.expectation import (
+    Array,
     Expectation,
     expectation_from_noise,
-    expectation_from_run,
+    expectations_from_run,
     operating_points,
 )
 from rig.tuning.gains import (
@@ -123,7 +125,9 @@ def tune(
     points = [OperatingPoint(at_rest_m, FAST_SPEED_M_PER_S)]
     if steps is not None:
         points = operating_points(steps, plan.strut_names) or points
-    loops = _Loops(plan, plant, responses, points, _expectations(plan, source, steps, responses))
+    mobility = mobility_matrix(plant, at_rest_m)
+    expectations = _expectations(plan, source, steps, mobility)
+    loops = _Loops(plan, plant, responses, mobility, points, expectations)
     if isinstance(source, Path) and (recorded := plan_of_run(source)).model != plan.model:
         progress("the run with this model", 0.0)
         loops = _follow_with_own_model(loops, recorded, source, aim)
@@ -158,15 +162,17 @@ def _expectations(
     plan: Plan,
     source: Path | StatedExpectation,
     steps: "pa.Table | None",
-    responses: Sequence[StrutResponse],
+    mobility_per_kg: Array,
 ) -> list[Expectation]:
-    """What the observers have to expect, from the steps of a run or as stated."""
+    """What the observers have to expect, from the steps of a run or as stated.
+
+    The mobilities are the acceleration of each height per newton in each strut.
+    """
+    if steps is not None and isinstance(source, Path):
+        return expectations_from_run(steps, source, plan.strut_names, mobility_per_kg)
     found: list[Expectation] = []
-    for height, response in zip(plan.heights, responses, strict=True):
-        if steps is not None and isinstance(source, Path):
-            per_kg = response.mobility_per_kg
-            found.append(expectation_from_run(steps, source, height.name, per_kg))
-        elif isinstance(source, StatedExpectation):
+    for height in plan.heights:
+        if isinstance(source, StatedExpectation):
             noise_std_m = source.noise_std_m or _quantisation_m(height)
             found.append(expectation_from_noise(noise_std_m, source.rms_n, source.up_to_hz))
     return found
@@ -184,7 +190,7 @@ def _follow_with_own_model(loops: "_Loops", recorded: Plan, run: Path, aim: Aim)
     }
     own = recorded.with_model(plan.model).with_observers(followers)
     steps = replay(run, plan=own).steps
-    return loops._replace(expectations=_expectations(plan, run, steps, loops.responses))
+    return loops._replace(expectations=_expectations(plan, run, steps, loops.mobility_per_kg))
 
 
 class _Loops(NamedTuple):
@@ -194,6 +200,7 @@ class _Loops(NamedTuple):
         plan: The configuration.
         plant: Its model.
         responses: Response of each strut.
+        mobility_per_kg: Acceleration of each height per newton in each strut, (struts, struts).
         points: Motions in which the loops have to be stable.
         expectations: What the observer of each strut has to expect.
     """
@@ -201,6 +208,7 @@ class _Loops(NamedTuple):
     plan: Plan
     plant: AnyPlant
     responses: Sequence[StrutResponse]
+    mobility_per_kg: Array
     points: Sequence[OperatingPoint]
     expectations: Sequence[Expectation]
 
@@ -247,7 +255,7 @@ def _find_delay(
         source,
         own,
         strut,
-        loops.responses[index].mobility_per_kg,
+        dict(zip(plan.strut_names, loops.mobility_per_kg[index].tolist(), strict=True)),
         follow,
         lambda share: progress("latency", 0.7 * share),
     )

@@ -56,7 +56,7 @@ def point(given):
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=noise_m), 1e7)
     answers = strut_responses(truth.plant, [truth.rest_m])
     [(mobility, *_)] = answers
-    seen = longest_stretch(follow(truth, first, start), Path("grid"), STRUT, mobility)
+    seen = longest_stretch(follow(truth, first, start), Path("grid"), STRUT, {STRUT: mobility})
     noise_std_m, residual_n = residual_force(seen, mobility)
     expectation = Expectation(noise_std_m, *spectrum(seen.t_s, residual_n), "its run")
     timing = SampleTiming(truth.period_ns)
@@ -156,7 +156,7 @@ def share(case):
 
 def smoothed_share(case, folder):
     """The same of the force that is smoothed over the whole run."""
-    seen = longest_stretch(open_steps(folder), folder, STRUT, 0.1)
+    seen = longest_stretch(open_steps(folder), folder, STRUT, {STRUT: 0.1})
     _, residual_n = residual_force(seen, 0.1)
     force_n = residual_n + np.interp(seen.t_s, seen.tick_s, seen.law_force_n)
     settled = seen.t_s >= 0.5

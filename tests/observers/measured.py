@@ -83,7 +83,9 @@ def compare(name, record, force_n=None):
     [(mobility, *_)] = answers
     corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)
-    seen = longest_stretch(follow(record, record.height_m, start), Path(name), STRUT, mobility)
+    seen = longest_stretch(
+        follow(record, record.height_m, start), Path(name), STRUT, {STRUT: mobility}
+    )
     noise_std_m, residual_n = residual_force(seen, mobility)
     smoothed = np.interp(seen.tick_s, seen.t_s, residual_n) + seen.law_force_n
     # The stretch may end, and begin again, where the bench suddenly moves more.
