@@ -48,11 +48,14 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
         read_columns = read_text_columns
     t_s, readings, assumptions = read_columns(source, mapping, outputs)
     _check_times(source, t_s)
-    values = [
-        output.factor * column + output.offset
-        for output, column in zip(outputs, readings, strict=True)
-    ]
-    names = ("t_s", *(output.name for output in outputs))
+    written: dict[str, Array] = {}
+    for output, column in zip(outputs, readings, strict=True):
+        value = output.factor * column + output.offset
+        if output.subtracted_from:
+            written[output.subtracted_from] = written[output.subtracted_from] - value
+        else:
+            written[output.name] = value
+    names, values = ("t_s", *written), list(written.values())
     assumptions += [output.words for output in outputs]
     missing = np.isnan(values[0])
     if missing.any():
@@ -106,9 +109,9 @@ def _assume_signs(mapping: TableMapping) -> list[str]:
     signs = ["height is taken as positive when the bodies move apart"]
     if mapping.applied_force is not None:
         signs.append("applied force is taken as positive upwards, without the weight")
-    if mapping.strut_force is not None:
+    if mapping.strut_force is not None or mapping.strut_forces:
         signs.append("strut force is taken as positive when the strut pushes its bodies apart")
-    if mapping.applied_force is None:
+    if mapping.applied_force is None and not mapping.inputs:
         signs.append("there is no applied force: the motion is taken as prescribed")
     return signs
 

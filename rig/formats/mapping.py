@@ -12,7 +12,10 @@ from can_dbc.calibration import Calibration
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, SiConversion, si_conversion
 from can_dbc.yaml_file import Finite, Positive, load_yaml
+from dart_model.spec import InputName
+from dart_model.spec import Name as StrutName
 from rig.channels.channel import Zero
+from rig.channels.measured_quantities import ACCELERATION, APPLIED_FORCE, APPLIED_TORQUE, MOTION
 
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Unit = Annotated[str, Field(min_length=1, max_length=40)]
@@ -137,6 +140,17 @@ class HeightChannel(_Channel):
         return self
 
 
+class StrutHeight(HeightChannel):
+    """A height of one of several struts.
+
+    Attributes:
+        less: Column of the same unit and gain that is subtracted: where positions were measured,
+            the height is that of the upper end less that of the lower one.
+    """
+
+    less: ColumnName | None = None
+
+
 class ForceChannel(_Channel):
     """A force.
 
@@ -156,6 +170,45 @@ class ForceChannel(_Channel):
     def calibration(self) -> Calibration:
         """By the tare and the direction of the cell."""
         return Calibration(self.tare_n, 0.0, self.reversed)
+
+
+class AccelerationChannel(_Channel):
+    """A measured acceleration of a body that is moved.
+
+    Attributes:
+        unit: Unit of gain times reading, such as `m/s^2` or `g`.
+        reversed: True if the table has the opposite sign.
+    """
+
+    reversed: bool = False
+
+    @property
+    def calibration(self) -> Calibration:
+        """By the direction of the sensor."""
+        return Calibration(0.0, 0.0, self.reversed)
+
+
+class InputChannel(ForceChannel):
+    """What drives the bench: a force, a torque, or the motion of a body.
+
+    Attributes:
+        unit: Unit of gain times reading, such as `kN`, `Nm` or `mm`.
+        measures: `force`, `torque`, or `motion` of a body.
+        tare_n: Only for a force: reading without a force, in N after the gain and the conversion
+            of the unit and before a reversal.
+        acceleration: Only for a motion: the measured acceleration of the body.
+    """
+
+    measures: Literal["force", "torque", "motion"]
+    acceleration: AccelerationChannel | None = None
+
+    @model_validator(mode="after")
+    def _fits_what_it_measures(self) -> "InputChannel":
+        if self.acceleration is not None and self.measures != "motion":
+            raise ValueError(f"acceleration: expected none with measures: {self.measures}")
+        if self.tare_n and self.measures != "force":
+            raise ValueError(f"tare_n: expected none with measures: {self.measures}")
+        return self
 
 
 class TemperatureChannel(_Channel):
@@ -181,25 +234,35 @@ class TableMapping(_Section):
         table: Layout of a text table. Of its keys, only `first_row` and `rows` are also used for
             XLSX, TDMS and MTS files; MF4 files use none of them.
         time: Times of the rows; required except for MF4 files, whose channels have times.
-        height: Height of the strut, which grows in rebound.
-        applied_force: Force on the body, positive upwards (force-driven bench); this or
-            `strut_force` is required.
-        strut_force: Force of the load cell, positive when the strut pushes its ends apart; this or
-            `applied_force` is required.
+        height: Height of the only strut, which grows in rebound; this or `heights` is required.
+        heights: Heights of several struts, by their names in the model.
+        applied_force: Force on the body, positive upwards (force-driven bench); this, `inputs` or a
+            strut force is required.
+        inputs: What drives the bench, by the names of the model's inputs.
+        strut_force: Force of the load cell, positive when the strut pushes its ends apart.
+        strut_forces: The same of several struts, by their names in the model.
         temperature: Temperature of the damper.
     """
 
     table: TextLayout = TextLayout()
     time: TimeColumn | None = None
-    height: HeightChannel
+    height: HeightChannel | None = None
+    heights: dict[StrutName, StrutHeight] = Field(default_factory=dict[str, StrutHeight])
     applied_force: ForceChannel | None = None
+    inputs: dict[InputName, InputChannel] = Field(default_factory=dict[str, InputChannel])
     strut_force: ForceChannel | None = None
+    strut_forces: dict[StrutName, ForceChannel] = Field(default_factory=dict[str, ForceChannel])
     temperature: TemperatureChannel | None = None
 
     @model_validator(mode="after")
     def _has_a_force(self) -> "TableMapping":
-        if self.applied_force is None and self.strut_force is None:
-            raise ValueError("expected applied_force or strut_force in addition to height")
+        if (self.height is None) == (not self.heights):
+            raise ValueError("expected one of height and heights")
+        if not (self.applied_force or self.strut_force or self.inputs or self.strut_forces):
+            raise ValueError(
+                "expected applied_force or strut_force (or inputs or strut_forces) in addition to "
+                "the height"
+            )
         return self
 
 
@@ -222,6 +285,8 @@ class OutputColumn(NamedTuple):
 
     Attributes:
         unit: Unit of the reading, or with a gain that of gain times reading.
+        subtracted_from: Name of the column from which it is subtracted instead of being written;
+            empty for a column of its own.
     """
 
     name: str
@@ -232,6 +297,7 @@ class OutputColumn(NamedTuple):
     factor: float
     offset: float
     words: str
+    subtracted_from: str = ""
 
 
 def output_columns(mapping: TableMapping) -> list[OutputColumn]:
@@ -240,21 +306,49 @@ def output_columns(mapping: TableMapping) -> list[OutputColumn]:
     Raises:
         InputError: A unit is unknown or of another dimension.
     """
-    channels = (
-        ("height_m", mapping.height, Dimension.LENGTH),
-        ("applied_force_n", mapping.applied_force, Dimension.FORCE),
-        ("strut_force_n", mapping.strut_force, Dimension.FORCE),
-        ("temperature_c", mapping.temperature, Dimension.TEMPERATURE),
-    )
-    return [
-        _output_column(name, channel, dimension)
-        for name, channel, dimension in channels
-        if channel is not None
-    ]
+    columns: list[OutputColumn] = []
+    if mapping.height is not None:
+        columns.append(_output_column("height_m", "height", mapping.height, Dimension.LENGTH))
+    for strut, height in mapping.heights.items():
+        name, key = f"height_m:{strut}", f"heights.{strut}"
+        columns.append(_output_column(name, key, height, Dimension.LENGTH))
+        if height.less is not None:
+            unit = height.unit
+            conversion = unit_conversion(unit, Dimension.LENGTH, key)
+            factor = columns[-1].factor
+            words = f"{name} less {factor:.9g} * column {height.less!r}"
+            has_gain = height.gain != 1.0
+            offset = conversion.offset
+            columns.append(
+                OutputColumn("", key, height.less, unit, has_gain, factor, offset, words, name)
+            )
+    if mapping.applied_force is not None:
+        name, key = APPLIED_FORCE.column, APPLIED_FORCE.key
+        columns.append(_output_column(name, key, mapping.applied_force, Dimension.FORCE))
+    for name, item in mapping.inputs.items():
+        quantity, key = _MEASURED[item.measures], f"inputs.{name}"
+        columns.append(_output_column(f"{quantity.column}:{name}", key, item, quantity.dimension))
+        if item.acceleration is not None:
+            further, key = f"{ACCELERATION.column}:{name}", f"{key}.acceleration"
+            dimension = ACCELERATION.dimension
+            columns.append(_output_column(further, key, item.acceleration, dimension))
+    if mapping.strut_force is not None:
+        channel = mapping.strut_force
+        columns.append(_output_column("strut_force_n", "strut_force", channel, Dimension.FORCE))
+    for strut, channel in mapping.strut_forces.items():
+        name, key = f"strut_force_n:{strut}", f"strut_forces.{strut}"
+        columns.append(_output_column(name, key, channel, Dimension.FORCE))
+    if mapping.temperature is not None:
+        channel, dimension = mapping.temperature, Dimension.TEMPERATURE
+        columns.append(_output_column("temperature_c", "temperature", channel, dimension))
+    return columns
 
 
-def _output_column(name: str, channel: _Channel, dimension: Dimension) -> OutputColumn:
-    key = name.rpartition("_")[0]
+_MEASURED = {"force": APPLIED_FORCE, "torque": APPLIED_TORQUE, "motion": MOTION}
+"""What an input `measures`."""
+
+
+def _output_column(name: str, key: str, channel: _Channel, dimension: Dimension) -> OutputColumn:
     conversion = unit_conversion(channel.unit, dimension, key)
     calibration = channel.calibration
     factor = calibration.sign * conversion.factor * channel.gain

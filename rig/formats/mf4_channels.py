@@ -21,6 +21,7 @@ def read_mf4_channels(
     Raises:
         InputError: The package asammdf is missing, the file is damaged, or a channel is not there.
     """
+    del mapping  # The channels have times of their own.
     try:
         asammdf = importlib.import_module("asammdf")  # optional, and slow to import
         damaged = cast("type[Exception]", asammdf.blocks.utils.MdfException)
@@ -38,7 +39,7 @@ def read_mf4_channels(
         raise InputError(f"{source}: is no such MF4 file, or is damaged: {reason}") from error
     at_s = signals[0][0]
     t_s = at_s - at_s[0]
-    assumptions = [f"t_s from the times of channel {mapping.height.column!r}, 0 at {at_s[0]:.9g} s"]
+    assumptions = [f"t_s from the times of channel {outputs[0].column!r}, 0 at {at_s[0]:.9g} s"]
     values = [signals[0][1]]
     for output, (own_s, readings) in zip(outputs[1:], signals[1:], strict=True):
         values.append(np.interp(at_s, own_s, readings))
