@@ -20,6 +20,7 @@ from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
+from rig.recordings.counted_times import counted_times_s
 from rig.recordings.gaps import are_timed, find_gaps
 from rig.recordings.recording import Array, RecordedInput, Recording, RecordingError
 
@@ -122,12 +123,22 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
     if valid is not None:
         validity = decode_log(message, [valid.signal], [Dimension.NUMBER], data)[valid.signal]
         good &= validity == valid.value
+    counter = channel.counter
+    if message.protection is not None:
+        counter = message.protection.counter_signal
     if channel.time:
         stamps_s = decode_log(message, [channel.time], [Dimension.TIME], data)[channel.time]
         good &= np.isfinite(stamps_s)
         times_s = _stamped_times_s(t_ns[good], stamps_s[good], channel)
     else:
-        times_s = _grid_times_s(t_ns[good], message.cycle_time_ns)
+        times_s = None
+        if counter and message.cycle_time_ns is not None:
+            counts = decode_log(message, [counter], [Dimension.NUMBER], data)[counter][good]
+            # It goes round behind its largest value, which a profile may forbid.
+            modulus = int(counts.max(initial=0.0)) + 1
+            times_s = counted_times_s(t_ns[good], counts, modulus, message.cycle_time_ns)
+        if times_s is None:
+            times_s = _grid_times_s(t_ns[good], message.cycle_time_ns)
     if times_s is None:
         good[good] = are_timed(t_ns[good])
         times_s = np.asarray(t_ns[good] * 1e-9, dtype=np.float64)
