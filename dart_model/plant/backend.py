@@ -63,7 +63,7 @@ class Backend(Protocol[Value]):
         """Write what is moved into coordinates and rates."""
         ...
 
-    def applied_force_n(self, inputs: Value) -> float:
+    def applied_force_n(self, inputs: Value, /) -> float:
         """Applied force of the laws that depend on one: the first force of the inputs."""
         ...
 
@@ -78,6 +78,7 @@ class OneCoordinate:
     dot = staticmethod(operator.mul)
     drive = staticmethod(operator.mul)
     value = staticmethod(operator.itemgetter(0))
+    applied_force_n = staticmethod(float)
 
     def __init__(self, skeleton: Skeleton) -> None:
         coordinate = skeleton.dart.getDof(0)
@@ -106,9 +107,6 @@ class OneCoordinate:
 
     def put_moved(self, q: float, v: float, inputs: float) -> None:
         """Nothing: its only coordinate is free."""
-
-    def applied_force_n(self, inputs: float) -> float:
-        return inputs
 
     def _accelerate_from(self, q: float, v: float, force: float) -> float:
         self._put_position(q)

@@ -33,6 +33,7 @@ class EquationsOfMotion(Generic[Value]):
         self._no_rates = [0.0] * sum(strut.states for strut in struts)
         self._geometry = geometry
         self._is_free = geometry.is_free
+        self._is_moved = not all(geometry.is_free)
         constant = geometry.constant
         self._constant = None if constant is None else self._configuration(constant)
         # The next force is computed where a tick ends: its configuration is computed once.
@@ -88,6 +89,7 @@ class EquationsOfMotion(Generic[Value]):
             accelerations,
             q,
             v,
+            drive,
             acceleration,
             rates,
         )
@@ -111,11 +113,13 @@ class EquationsOfMotion(Generic[Value]):
         virtual_forces_n, temperature_c = loaded.virtual_forces_n, loaded.temperature_c
         dot, acceleration, no_rates = backend.dot, backend.acceleration, self._no_rates
         drive, put_moved, applied = backend.drive, backend.put_moved, backend.applied_force_n
+        is_moved = self._is_moved
 
         def slope(
             q: Value, v: Value, internal: Internal, t_s: float, inputs: Value
         ) -> tuple[Value, Sequence[float]]:
-            put_moved(q, v, inputs)
+            if is_moved:
+                put_moved(q, v, inputs)
             struts, columns = constant or self._at(q)
             rates = no_rates.copy()
             total, applied_force_n = drive(columns, inputs), applied(inputs)
@@ -137,10 +141,11 @@ class EquationsOfMotion(Generic[Value]):
                 state.t_s,
                 dt_s,
                 count_steps(dt_s, longest_s),
-                backend.between(backend.value(loaded.inputs), end, dt_s),
+                backend.between(loaded.drive, end, dt_s),
             ),
         )
-        put_moved(q, v, end)
+        if is_moved:
+            put_moved(q, v, end)
         return self._state(q, v, internal, state.t_s + dt_s)
 
     def _state(self, q: Value, v: Value, internal: Internal, t_s: float) -> PlantState:

@@ -38,6 +38,7 @@ class Loaded(Struct, frozen=True, gc=False):
         accelerations_m_per_s2: Second derivative of each strut's height under all forces.
         position: Coordinates, for the integrator: a float where there is one, else an array.
         velocity: Their rates, likewise.
+        drive: Inputs, likewise: a float where there is one.
         acceleration: Their second derivative, likewise.
     """
 
@@ -49,6 +50,7 @@ class Loaded(Struct, frozen=True, gc=False):
     accelerations_m_per_s2: list[float]
     position: Any
     velocity: Any
+    drive: Any
     acceleration: Any
     internal_rates: list[float]
 

@@ -141,6 +141,7 @@ class FreeModelEstimator:
             for channel in item.channels:
                 self._input_of[channel.index] = index
         self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
+        self._silences_ns = [grace + stale_after_ns for grace in self._graces_ns]
 
     @property
     def struts(self) -> int:
@@ -192,47 +193,40 @@ class FreeModelEstimator:
         received = self._sort(step_input.samples)
         if state.model is None:
             return self._start_if_possible(state, step_input, received)
-        inputs = self._update_inputs(state.inputs, step_input.samples)
-        if self._was_silent(state, inputs):
+        inputs, was_silent = self._update_inputs(state, step_input.samples)
+        if was_silent:
             # The observers took what was missing of the input for a force of the strut.
             state = self.restart(state, step_input.t_ns)
             return self._start_if_possible(state, step_input, received)
         return self._observe(state, state.model, step_input, received, inputs)
 
     def _update_inputs(
-        self, states: tuple[object, ...], samples: Sequence[Sample]
-    ) -> tuple[object, ...]:
-        """States of the inputs after the samples of a step."""
-        inputs: list[object] | None = None
-        input_of = self._input_of
+        self, state: FreeModelState, samples: Sequence[Sample]
+    ) -> tuple[tuple[object, ...], bool]:
+        """States of the inputs after samples, and whether one comes after heights without it."""
+        states, input_of, was_silent = state.inputs, self._input_of, False
         for sample in samples:
             index = input_of[sample.channel]
-            if index >= 0:
-                inputs = list(states) if inputs is None else inputs
-                inputs[index] = self._inputs[index].update(inputs[index], sample)
-        return states if inputs is None else tuple(inputs)
+            if index < 0:
+                continue
+            item, before = self._inputs[index], states[index]
+            after = item.update(before, sample)
+            if before is not None and state.model is not None:
+                end_ns = item.measured_ns(before) + self._silences_ns[index]
+                if sample.t_ns > end_ns and self._has_heights_since(end_ns, state):
+                    was_silent = True
+            states = (
+                (*states[:index], after, *states[index + 1 :]) if index else (after, *states[1:])
+            )
+        return states, was_silent
 
     def _input_vector(self, states: Sequence[object], t_ns: int) -> tuple[float, ...]:
         """What drives the model at a time."""
-        vector: tuple[float, ...] = ()
-        for item, state in zip(self._inputs, states, strict=True):
-            vector += item.values(state, t_ns)
+        inputs = self._inputs
+        vector = inputs[0].values(states[0], t_ns)
+        for index in range(1, len(inputs)):
+            vector += inputs[index].values(states[index], t_ns)
         return vector
-
-    def _was_silent(self, state: FreeModelState, inputs: tuple[object, ...]) -> bool:
-        """Whether an input comes again after heights have come without it."""
-        if inputs is state.inputs:
-            return False
-        for index, (before, now) in enumerate(zip(state.inputs, inputs, strict=True)):
-            if before is None or now is before:
-                continue
-            last_ns, new_ns = map(self._inputs[index].measured_ns, (before, now))
-            silence_ns = self._graces_ns[index] + self._stale_after_ns
-            if new_ns - last_ns > silence_ns and self._has_heights_since(
-                last_ns + silence_ns, state
-            ):
-                return True
-        return False
 
     def _sort(self, samples: Sequence[Sample]) -> list[Sample | None]:
         """The newest samples, by what they are used for."""
@@ -260,7 +254,7 @@ class FreeModelEstimator:
             temperature_c,
             first,
             state.observers,
-            inputs=self._update_inputs(state.inputs, step_input.samples),
+            inputs=self._update_inputs(state, step_input.samples)[0],
             bands=state.bands,
         )
         return state, self._can_start(state, required)
@@ -341,9 +335,9 @@ class FreeModelEstimator:
 
     def _newest_input_ns(self, inputs: Sequence[object], newest_ns: int) -> int:
         """Time up to which the inputs are known well enough, if that is before `newest_ns`."""
-        for item, known, grace in zip(self._inputs, inputs, self._graces_ns, strict=True):
+        for index, known in enumerate(inputs):
             if known is not None:
-                known_ns = item.measured_ns(known) + grace
+                known_ns = self._inputs[index].measured_ns(known) + self._graces_ns[index]
                 newest_ns = min(newest_ns, known_ns)
         return newest_ns
 
@@ -376,7 +370,6 @@ class FreeModelEstimator:
             further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
-        law_errors_n: list[float] = []
         bands: list[InnovationBand] = []
         oldest_ns = t_ns
         known = self._with_slopes(state.observers, model, inputs, temperature_c)
@@ -405,9 +398,9 @@ class FreeModelEstimator:
             bands.append(band)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
-            law_errors_n.append(observed.law_error_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         if state.decoupling:
+            law_errors_n = [observed.law_error_n for observed in observers]
             virtual_n = self._limit(combine(state.decoupling, virtual_n, law_errors_n))
         loaded = self._plant.load(model, virtual_n, inputs, temperature_c)
         oldest_ns = self._newest_input_ns(known_inputs, oldest_ns)
@@ -509,18 +502,29 @@ class FreeModelEstimator:
         left_out: tuple[int, ...] = ()
         size = sum(loaded.inputs)
         is_calm, matrix = state.is_settled, state.decoupling
-        residuals_n = [observer.residual_force_n for observer in state.observers]
-        stds_n = [observer.force_std_n for observer in state.observers]
+        t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
+        residuals_n: list[float] = []
+        stds_n: list[float] = []
         if matrix:
+            residuals_n = [observer.residual_force_n for observer in state.observers]
+            stds_n = [observer.force_std_n for observer in state.observers]
             law_errors_n = [observer.law_error_n for observer in state.observers]
             residuals_n = combine(matrix, residuals_n, law_errors_n)
             stds_n = combine_stds(matrix, stds_n)
         for strut, observer in enumerate(state.observers):
-            if self._is_disturbed(state, strut, virtual_n[strut]):
+            if (
+                observer.is_disturbed
+                or bands[strut].is_left
+                or t_ns - observer.measured_ns > longest_gaps_ns[strut]
+                or (matrix and self._is_at_limit(strut, virtual_n[strut]))
+            ):
                 is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]
-            force_n = law_force_n + residuals_n[strut]
+            residual_n, std_n = observer.residual_force_n, observer.force_std_n
+            if matrix:
+                residual_n, std_n = residuals_n[strut], stds_n[strut]
+            force_n = law_force_n + residual_n
             output = StrutOutput(
                 force_n,
                 virtual_n[strut],
@@ -529,7 +533,7 @@ class FreeModelEstimator:
                 velocity_m_per_s,
                 loaded.accelerations_m_per_s2[strut],
                 observer.innovation_m,
-                stds_n[strut],
+                std_n,
                 law_force_n,
             )
             struts.append(output)
@@ -544,24 +548,21 @@ class FreeModelEstimator:
         estimate = Estimate(tuple(struts), measured_ns, state.is_settled, diverged, left_out)
         return state, estimate
 
-    def _is_disturbed(self, state: FreeModelState, strut: int, virtual_force_n: float) -> bool:
-        """Whether a strut's estimate is not what it would be had nothing ever been missing."""
-        observer = state.observers[strut]
-        return (
-            observer.is_disturbed
-            or state.bands[strut].is_left
-            or state.t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-            or (
-                bool(state.decoupling)
-                and abs(virtual_force_n) >= self.observers[strut].force_limit_n
-            )
-        )
+    def _is_at_limit(self, strut: int, virtual_force_n: float) -> bool:
+        """Whether a virtual force is at its limit, so that the model cannot follow."""
+        return abs(virtual_force_n) >= self.observers[strut].force_limit_n
 
     def _settle(self, state: FreeModelState, virtual_forces_n: Sequence[float]) -> FreeModelState:
         """State with the times of the last disturbances, and whether every strut has settled."""
         is_settled, t_ns, disturbed_ns = True, state.t_ns, list(state.disturbed_ns)
         for strut, settling_ns in enumerate(self._settling_ns):
-            if self._is_disturbed(state, strut, virtual_forces_n[strut]):
+            observer = state.observers[strut]
+            if (
+                observer.is_disturbed
+                or state.bands[strut].is_left
+                or t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
+                or (bool(state.decoupling) and self._is_at_limit(strut, virtual_forces_n[strut]))
+            ):
                 disturbed_ns[strut] = t_ns
                 is_settled = False
             elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:

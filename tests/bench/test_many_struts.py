@@ -45,7 +45,7 @@ class Standing(Struct, frozen=True, gc=False):
     struts: Sequence[tuple[float, float]]
     forces_n: Sequence[float]
     accelerations_m_per_s2: Sequence[float]
-    applied_force_n: float = 0.0
+    inputs: tuple[float, ...] = (0.0,)
     temperature_c: float = 20.0
 
     @property
@@ -56,15 +56,17 @@ class Standing(Struct, frozen=True, gc=False):
 class StandStill:
     """A model that answers a secant as a strut on a body does, and does not move."""
 
+    inputs = 1
+
     def __init__(self, spec) -> None:
         self.struts = len(spec.struts)
 
-    def init(self, heights_m, velocities_m_per_s=None, t_s=0.0) -> Standing:
+    def init(self, heights_m, velocities_m_per_s=None, t_s=0.0, inputs=None) -> Standing:
         heights = [0.35 if math.isnan(height) else height for height in heights_m]
         rates = velocities_m_per_s or [0.0] * self.struts
         return Standing(tuple(zip(heights, rates, strict=True)), (0.0,) * self.struts, ())
 
-    def load(self, state, virtual_forces_n, _applied_force_n, _temperature_c) -> Standing:
+    def load(self, state, virtual_forces_n, _inputs, _temperature_c) -> Standing:
         if state.accelerations_m_per_s2:
             return state
         answers = tuple(
@@ -73,10 +75,10 @@ class StandStill:
         )
         return Standing(state.struts, state.forces_n, answers)
 
-    def step(self, loaded, _dt_s, _applied_force_end_n) -> Standing:
+    def step(self, loaded, _dt_s, _inputs_end) -> Standing:
         return loaded
 
-    def slopes(self, _state, _applied_force_n, _temperature_c) -> None:
+    def slopes(self, _state, _inputs, _temperature_c) -> None:
         return None
 
 
