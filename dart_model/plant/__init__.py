@@ -103,7 +103,7 @@ class DartPlant:
     @property
     def free_coordinates(self) -> int:
         """Number of coordinates that are free to move."""
-        return len(self._skeleton.inputs.free)
+        return len(self.free)
 
     @property
     def motion_columns(self) -> NDArray[np.intp]:
@@ -149,7 +149,7 @@ class DartPlant:
         if not given.all():
             q = self._resting(q, np.asarray(heights_m, np.float64))
         if velocities_m_per_s is not None:
-            struts, free = self._geometry.at(q).struts[given], self._skeleton.inputs.free
+            struts, free = self._geometry.at(q).struts[given], self.free
             own = np.asarray(velocities_m_per_s)[given] - struts @ v
             v[free] = np.linalg.lstsq(struts[:, free], own, rcond=None)[0]
         return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
@@ -164,7 +164,7 @@ class DartPlant:
 
         Where there is no such rest within a metre, these directions stay as they are.
         """
-        start, own = q, np.eye(self.coordinates)[:, self._skeleton.inputs.free]
+        start, own = q, np.eye(self.coordinates)[:, self.free]
         for _ in range(_RESTING_STEPS):
             given = self._geometry.at(q).struts[np.isfinite(heights_m)]
             free: Array = null_space(given @ own)

@@ -215,9 +215,7 @@ class FreeModelEstimator:
                 end_ns = item.measured_ns(before) + self._silences_ns[index]
                 if sample.t_ns > end_ns and self._has_heights_since(end_ns, state):
                     was_silent = True
-            states = (
-                (*states[:index], after, *states[index + 1 :]) if index else (after, *states[1:])
-            )
+            states = (*states[:index], after, *states[index + 1 :])
         return states, was_silent
 
     def _input_vector(self, states: Sequence[object], t_ns: int) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ fading-memory polynomial filters of second and of first degree.
 """
 
 import math
+from collections.abc import Callable
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -30,17 +31,45 @@ class TrackedMotion(Struct, frozen=True, gc=False):
 
 def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
     """The motion after a new measured position; older ones fade with a time constant."""
+    return _correct(motion, sample, settling_s, _gains_of_second_degree)
+
+
+def update_with_acceleration(
+    motion: TrackedMotion, sample: Sample, settling_s: float
+) -> TrackedMotion:
+    """The motion after a new measured position, its acceleration being that of a sensor."""
+    return _correct(motion, sample, settling_s, _gains_of_first_degree)
+
+
+def _gains_of_second_degree(kept: float) -> tuple[float, float, float]:
+    """Gains of position, velocity and acceleration, in units of the time between two samples."""
+    fresh = 1.0 - kept
+    return 1.0 - kept**3, 1.5 * fresh * fresh * (1.0 + kept), fresh**3
+
+
+def _gains_of_first_degree(kept: float) -> tuple[float, float, float]:
+    """The same without a correction of the acceleration."""
+    fresh = 1.0 - kept
+    return 1.0 - kept * kept, fresh * fresh, 0.0
+
+
+def _correct(
+    motion: TrackedMotion,
+    sample: Sample,
+    settling_s: float,
+    gains: Callable[[float], tuple[float, float, float]],
+) -> TrackedMotion:
+    """The motion after a position, by gains of the share that is kept of what was known."""
     age_s = (sample.t_ns - motion.measured_ns) * 1e-9
     if age_s <= 0.0:
         return motion
     position_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
     innovation_m = sample.value - position_m
-    kept = math.exp(-age_s / settling_s)
-    fresh = 1.0 - kept
+    of_position, of_velocity, of_acceleration = gains(math.exp(-age_s / settling_s))
     return TrackedMotion(
-        position_m + (1.0 - kept**3) * innovation_m,
-        velocity + 1.5 * fresh * fresh * (1.0 + kept) * innovation_m / age_s,
-        acceleration + fresh**3 * innovation_m / (age_s * age_s),
+        position_m + of_position * innovation_m,
+        velocity + of_velocity * innovation_m / age_s,
+        acceleration + of_acceleration * innovation_m / (age_s * age_s),
         innovation_m,
         sample.t_ns,
     )
@@ -55,26 +84,6 @@ def predict_motion(motion: TrackedMotion, t_ns: int) -> tuple[float, float, floa
         motion.position_m + h * (motion.velocity_m_per_s + 0.5 * h * acceleration),
         velocity,
         acceleration,
-    )
-
-
-def update_with_acceleration(
-    motion: TrackedMotion, sample: Sample, settling_s: float
-) -> TrackedMotion:
-    """The motion after a new measured position, its acceleration being that of a sensor."""
-    age_s = (sample.t_ns - motion.measured_ns) * 1e-9
-    if age_s <= 0.0:
-        return motion
-    position_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
-    innovation_m = sample.value - position_m
-    kept = math.exp(-age_s / settling_s)
-    fresh = 1.0 - kept
-    return TrackedMotion(
-        position_m + (1.0 - kept * kept) * innovation_m,
-        velocity + fresh * fresh * innovation_m / age_s,
-        acceleration,
-        innovation_m,
-        sample.t_ns,
     )
 
 

@@ -13,7 +13,7 @@ from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
 STORIES = (STORY, "quarter_car_road")
-"""Cases that tell the whole method (`rig.demo.story.STORIES`)."""
+"""Cases that run the whole method (`rig.demo.story.STORIES`)."""
 
 EXAMPLES = (
     "Examples: `rig demo` · `rig demo --seed 7` · `rig demo --case quarter_car_road` · "

@@ -25,7 +25,7 @@ Ranges = Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]]
 
 @dataclass(frozen=True)
 class StoryBench:
-    """A bench of the package with which the story is told.
+    """A bench of the package that runs through the whole method.
 
     Attributes:
         configuration: Its configuration; that of the bench has `_bench` behind the name.
@@ -144,7 +144,7 @@ def run_story(
         seed: Draws the effect.
         folder: Where to write; absent or empty.
         options: How to run it; all runs but the first one are in lockstep in any case.
-        case: Bench with which it is told, one of `STORIES`.
+        case: Name of the bench, one of `STORIES`.
         chapter: Called with the next part of the story.
         diagnosis_progress: Called with the stage of the diagnosis and the share that is done.
 

@@ -27,8 +27,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from dart_model.effects import AMBIENT_C
 from rig.bridge.values import Mode
+from rig.closed_loop.strut_response import mobility_matrix
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import RunFolder, read_run
 from rig.plan.build import build_plant
@@ -109,7 +109,7 @@ def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, t
             come faster than ticks, or there is nothing to smooth.
     """
     names = plan.strut_names
-    mobility = _mobility(run, plan, names)
+    mobility = _mobility(run, plan)
     tick_s = run.steps.column("t_ns").to_numpy() * 1e-9
     struts = [_strut_columns(run, name) for name in names]
     forces = {name: (np.full(len(tick_s), np.nan), np.full(len(tick_s), np.nan)) for name in names}
@@ -140,7 +140,7 @@ def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, t
     return forces
 
 
-def _mobility(run: RunFolder, plan: Plan, names: list[str]) -> Array:
+def _mobility(run: RunFolder, plan: Plan) -> Array:
     """Second derivative of each height per newton in each strut, in 1/kg."""
     _refuse_unsmoothable(run, plan)
     plant = build_plant(plan)
@@ -149,15 +149,7 @@ def _mobility(run: RunFolder, plan: Plan, names: list[str]) -> Array:
             f"{run.folder}: model {plan.model.name}: smoothing requires a model whose masses move "
             "along straight guides"
         )
-    rest = plant.numbers(plant.init([strut.free_length_m for strut in plan.struts]))
-    state, no_inputs = plant.state_of([0.0] * len(rest)), (0.0,) * plant.inputs
-
-    def accelerations(virtual_n: Array) -> Array:
-        loaded = plant.load(state, tuple(virtual_n.tolist()), no_inputs, AMBIENT_C)
-        return np.array(loaded.accelerations_m_per_s2)
-
-    free = accelerations(np.zeros(len(names)))
-    mobility = np.column_stack([accelerations(unit) - free for unit in np.eye(len(names))])
+    mobility = mobility_matrix(plant, [strut.free_length_m for strut in plan.struts])
     singular = np.linalg.svd(mobility, compute_uv=False)
     if singular[-1] < _SINGULAR * singular[0]:
         raise InputError(f"{run.folder}: model {plan.model.name}: more struts than coordinates")

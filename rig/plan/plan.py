@@ -227,7 +227,7 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
     config = _with_names(config, model, database, source)
     applied = _input_of_applied_force(config, model, source)
     calibrated = _calibrate(config.signals, _quantities(model), database, source)
-    reader = _SignalReader(config, model, applied, calibrated, source)
+    reader = _SignalReader(config, model, calibrated, source)
     channels = reader.channels()
     outgoing = reader.outgoing()
     alarms = reader.alarms()
@@ -453,21 +453,13 @@ def _check_calibration(entry: MeasuredSignal, quantity: Quantity, key: str) -> N
 
 
 class _SignalReader:
-    """Looks the configured signals up in the DBC, each once; `read` has those it reads, by key.
-
-    `applied` is the input of the model that the applied force is; None where none is measured.
-    """
+    """Looks the configured signals up in the DBC, each once; `read` has those it reads, by key."""
 
     def __init__(
-        self,
-        config: RunConfig,
-        model: ModelSpec,
-        applied: str | None,
-        database: Database,
-        source: Path,
+        self, config: RunConfig, model: ModelSpec, database: Database, source: Path
     ) -> None:
         self._config, self._database, self._source = config, database, source
-        self._quantities, self._applied = _quantities(model), applied
+        self._quantities = _quantities(model)
         self._used = [(item.message, item.signal) for item in config.signals.height.values()]
         self._of_sender: dict[tuple[str, str], str | None] = {}
         self.read: dict[str, Message] = {}

@@ -72,6 +72,5 @@ def driven_by_force(folder: Path):
 def test_a_moving_base_costs_less_than_a_third_of_the_force_error(tmp_path):
     moved, shares = force_errors(*on_a_road(), tmp_path / "moved")
     still, _ = force_errors(*driven_by_force(tmp_path), tmp_path / "still")
-    print(moved, still, moved / still, shares)
     assert np.all(moved < 1.3 * still)
     assert min(shares) > 0.9

@@ -139,11 +139,11 @@ def mechanism_along(plants: MechanismPlants, motion: Track, inputs: Array) -> Li
         mechanism = tabulate_mechanism(
             plants, motion.heights_m.T, motion.velocities_m_per_s.T, inputs
         )
-    return _with_mockups(mechanism, plants.plain, motion, inputs)
+    return _with_mockups(mechanism, plants.plain, motion)
 
 
 def _with_mockups(
-    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track, inputs: Array
+    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
 ) -> LinearisedMechanism:
     """The mechanism with the forces of FMUs, along a motion and linear about it."""
     if not any(plant.mockups):
@@ -153,7 +153,6 @@ def _with_mockups(
             f"model {plant.spec.name}: an FMU in a strut of a bench whose bodies are moved is not "
             "supported in a diagnosis, expected a bench that is driven by forces"
         )
-    del inputs
     nodes = len(motion.t_s)
     m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
     heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
