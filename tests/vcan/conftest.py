@@ -159,10 +159,9 @@ def run_until_signal(config: Path, folder: Path, watchdog: bool) -> None:
         live(ready, folder, control=RunControl(stop=stop))
 
 
-def run_for(config: Path, folder: Path, seconds: float) -> None:
+def run_plan(plan: Plan, folder: Path) -> None:
     """What `rig run` does."""
-    ready = load_plan(config, duration_s=seconds)
-    live(ready, folder, control=RunControl(progress=lambda _t_ns, _mode: None))
+    live(plan, folder, control=RunControl(progress=lambda _t_ns, _mode: None))
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,7 @@ from tests.vcan.conftest import (
     BENCH_IDS,
     Files,
     in_process,
-    run_for,
+    run_plan,
     run_until_signal,
 )
 
@@ -143,10 +143,12 @@ def recorded(bench, files, tmp_path_factory):
     """Bridge and bench as two processes for a while: the run, and candump's record."""
     folder = tmp_path_factory.mktemp("recorded")
     record = folder / "candump.log"
+    plan = load_plan(files.bridge(bench), duration_s=RECORDED_S)
+    plan = load_plan(files.bridge(bench), duration_s=RECORDED_S)
     with (
         record.open("wb") as out,
         running(["candump", "-L", "-r", "4000000", bench], stdout=out),
-        in_process(run_for, files.bridge(bench), folder / "run", RECORDED_S) as process,
+        in_process(run_plan, plan, folder / "run") as process,
     ):
         process.join(300.0)
     assert process.exitcode == 0
