@@ -55,8 +55,10 @@ class Backend(Protocol[Value]):
         """Columns as `drive` reads them, from an array of shape (n, inputs)."""
         ...
 
-    def between(self, begin: Value, end: Value, duration_s: float) -> Callable[[float], Value]:
-        """Inputs at a share of a step, from those at its ends."""
+    def motions_between(
+        self, begin: Value, end: Value, duration_s: float
+    ) -> Callable[[Value, float], None] | None:
+        """Writes what is moved, at a share of a step, into inputs; None where nothing is moved."""
         ...
 
     def put_moved(self, q: Value, v: Value, inputs: Value) -> None:
@@ -100,10 +102,8 @@ class OneCoordinate:
     def columns(self, columns: Array) -> float:
         return float(columns[0, 0])
 
-    def between(self, begin: float, end: float, duration_s: float) -> Callable[[float], float]:
-        del duration_s
-        rise = end - begin
-        return lambda share: begin + share * rise
+    def motions_between(self, begin: float, end: float, duration_s: float) -> None:
+        """None: its only coordinate is free."""
 
     def put_moved(self, q: float, v: float, inputs: float) -> None:
         """Nothing: its only coordinate is free."""
@@ -170,11 +170,12 @@ class ManyCoordinates:
     def columns(self, columns: Array) -> Array:
         return columns
 
-    def between(self, begin: Array, end: Array, duration_s: float) -> Callable[[float], Array]:
-        if self._moved is not None:
-            return self._moved.between(begin, end, duration_s)
-        rise = end - begin
-        return lambda share: begin + share * rise
+    def motions_between(
+        self, begin: Array, end: Array, duration_s: float
+    ) -> Callable[[Array, float], None] | None:
+        if self._moved is None or duration_s == 0.0:
+            return None
+        return self._moved.between(begin, end, duration_s)
 
     def put_moved(self, q: Array, v: Array, inputs: Array) -> None:
         if self._moved is not None:

@@ -113,12 +113,18 @@ class EquationsOfMotion(Generic[Value]):
         virtual_forces_n, temperature_c = loaded.virtual_forces_n, loaded.temperature_c
         dot, acceleration, no_rates = backend.dot, backend.acceleration, self._no_rates
         drive, put_moved, applied = backend.drive, backend.put_moved, backend.applied_force_n
+        begin, end = loaded.drive, backend.value(inputs_end)
+        rise = end - begin
         is_moved = self._is_moved
+        write_motions = backend.motions_between(begin, end, dt_s) if is_moved else None
 
         def slope(
-            q: Value, v: Value, internal: Internal, t_s: float, inputs: Value
+            q: Value, v: Value, internal: Internal, t_s: float, share: float
         ) -> tuple[Value, Sequence[float]]:
+            inputs = begin + share * rise
             if is_moved:
+                if write_motions:
+                    write_motions(inputs, share)
                 put_moved(q, v, inputs)
             struts, columns = constant or self._at(q)
             rates = no_rates.copy()
@@ -131,18 +137,12 @@ class EquationsOfMotion(Generic[Value]):
                 total = total + (force + virtual_forces_n[index]) * push
             return acceleration(q, v, total), rates
 
-        end = backend.value(inputs_end)
         q, v, internal = advance(
             slope,
             backend.move,
             (loaded.position, loaded.velocity, state.internal),
             (loaded.acceleration, loaded.internal_rates),
-            Course(
-                state.t_s,
-                dt_s,
-                count_steps(dt_s, longest_s),
-                backend.between(loaded.drive, end, dt_s),
-            ),
+            Course(state.t_s, dt_s, count_steps(dt_s, longest_s)),
         )
         if is_moved:
             put_moved(q, v, end)

@@ -54,26 +54,23 @@ class Moved(NamedTuple):
             q[coordinate] = sign * inputs[position]
             v[coordinate] = sign * inputs[position + 1]
 
-    def between(self, begin: Array, end: Array, duration_s: float) -> Callable[[float], Array]:
-        """The input vector at a share of a step.
+    def between(
+        self, begin: Array, end: Array, duration_s: float
+    ) -> Callable[[Array, float], None]:
+        """Writes the motions at a share of a step into an input vector.
 
-        Forces are linear over it, motions as of `dart_model.plant.motion_between`.
+        They are as of `dart_model.plant.motion_between`.
         """
-        rise = end - begin
-        if duration_s == 0.0:
-            return lambda share: begin + share * rise
         courses = [
             (part, coefficients(begin[part].tolist(), end[part].tolist(), duration_s))
             for part in (slice(first, first + 3) for first in self.positions.tolist())
         ]
 
-        def at_share(share: float) -> Array:
-            inputs = begin + share * rise
+        def write(inputs: Array, share: float) -> None:
             for part, course in courses:
                 inputs[part] = evaluate(course, share, duration_s)
-            return inputs
 
-        return at_share
+        return write
 
 
 class Inputs:

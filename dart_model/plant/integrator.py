@@ -9,7 +9,7 @@ Hairer, Nørsett, Wanner, "Solving Ordinary Differential Equations I" (1993), se
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -21,10 +21,10 @@ Value = TypeVar("Value", float, Array)
 Internal = tuple[float, ...]
 """Internal states."""
 
-Slope = Callable[[Value, Value, Internal, float, Value], tuple[Value, Sequence[float]]]
-"""Coordinates, their rates, internal states, time (s), inputs -> second derivative of the
-coordinates, derivative of the internal states. Moved coordinates and rates are written to where
-the inputs have them."""
+Slope = Callable[[Value, Value, Internal, float, float], tuple[Value, Sequence[float]]]
+"""Coordinates, their rates, internal states, time (s), share of all steps -> second derivative of
+the coordinates, derivative of the internal states. Moved coordinates and rates are written to where
+the inputs have them at that share."""
 
 Move = Callable[[Value, Value, float], Value]
 """Coordinates, rates, duration (s) -> coordinates after it."""
@@ -48,12 +48,11 @@ enough that the method is stable, as it is up to 2.5."""
 
 
 class Course(Struct, frozen=True, gc=False):
-    """Steps of equal length, and the inputs at a share of all of them."""
+    """Steps of equal length."""
 
     t_s: float
     duration_s: float
     steps: int
-    inputs: Callable[[float], Any]
 
 
 def advance(
@@ -65,7 +64,7 @@ def advance(
 ) -> tuple[Value, Value, Internal]:
     """Coordinates, rates and internal states after equal steps from a start with slope `first`."""
     (q, v, internal), (a1, rates1) = start, first
-    t_s, steps, inputs = course.t_s, course.steps, course.inputs
+    t_s, steps = course.t_s, course.steps
     h = course.duration_s / steps
     half, sixth = 0.5 * h, h / 6.0
     for step in range(1, steps + 1):
@@ -74,16 +73,15 @@ def advance(
             v + half * a1,
             propagate(internal, half, rates1) if internal else internal,
             t_s + half,
-            inputs((step - 0.5) / steps),
+            (step - 0.5) / steps,
         )
         t_s += h
-        given = inputs(step / steps)
         a3, rates3 = slope(
             move(q, v + h * a1, h),
             v + h * (2.0 * a2 - a1),
             propagate(propagate(internal, 2.0 * h, rates2), -h, rates1) if internal else internal,
             t_s,
-            given,
+            step / steps,
         )
         # The stages' own velocities drive the coordinates.
         q = move(q, v + sixth * (a1 + 2.0 * a2), h)
@@ -95,7 +93,7 @@ def advance(
             ]
             internal = propagate(internal, h, mean)
         if step < steps:
-            a1, rates1 = slope(q, v, internal, t_s, given)
+            a1, rates1 = slope(q, v, internal, t_s, step / steps)
     return q, v, internal
 
 

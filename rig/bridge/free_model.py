@@ -12,7 +12,7 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
-from rig.bridge.measured_inputs import AnyInput, grace_ns
+from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -55,7 +55,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
     disturbed_ns: tuple[int, ...] = ()
-    inputs: tuple[object, ...] = ()
+    inputs: tuple[InputState | None, ...] = ()
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
@@ -202,23 +202,22 @@ class FreeModelEstimator:
 
     def _update_inputs(
         self, state: FreeModelState, samples: Sequence[Sample]
-    ) -> tuple[tuple[object, ...], bool]:
+    ) -> tuple[tuple[InputState | None, ...], bool]:
         """States of the inputs after samples, and whether one comes after heights without it."""
-        states, input_of, was_silent = state.inputs, self._input_of, False
+        states, was_silent = list(state.inputs), False
         for sample in samples:
-            index = input_of[sample.channel]
+            index = self._input_of[sample.channel]
             if index < 0:
                 continue
-            item, before = self._inputs[index], states[index]
-            after = item.update(before, sample)
-            if before is not None and state.model is not None:
-                end_ns = item.measured_ns(before) + self._silences_ns[index]
+            before = states[index]
+            if before is not None:
+                end_ns = before.t_ns + self._silences_ns[index]
                 if sample.t_ns > end_ns and self._has_heights_since(end_ns, state):
                     was_silent = True
-            states = (*states[:index], after, *states[index + 1 :])
-        return states, was_silent
+            states[index] = self._inputs[index].update(before, sample)
+        return tuple(states), was_silent
 
-    def _input_vector(self, states: Sequence[object], t_ns: int) -> tuple[float, ...]:
+    def _input_vector(self, states: Sequence[InputState | None], t_ns: int) -> tuple[float, ...]:
         """What drives the model at a time."""
         inputs = self._inputs
         vector = inputs[0].values(states[0], t_ns)
@@ -331,11 +330,11 @@ class FreeModelEstimator:
         newest_ns = min(samples[-1].t_ns for samples in state.first if samples)
         return min(newest_ns, self._newest_input_ns(state.inputs, newest_ns))
 
-    def _newest_input_ns(self, inputs: Sequence[object], newest_ns: int) -> int:
+    def _newest_input_ns(self, inputs: Sequence[InputState | None], newest_ns: int) -> int:
         """Time up to which the inputs are known well enough, if that is before `newest_ns`."""
         for index, known in enumerate(inputs):
             if known is not None:
-                known_ns = self._inputs[index].measured_ns(known) + self._graces_ns[index]
+                known_ns = known.t_ns + self._graces_ns[index]
                 newest_ns = min(newest_ns, known_ns)
         return newest_ns
 
@@ -345,7 +344,7 @@ class FreeModelEstimator:
         loaded: LoadedModel[ModelState],
         step_input: StepInput,
         received: _Received,
-        known_inputs: tuple[object, ...],
+        known_inputs: tuple[InputState | None, ...],
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
@@ -456,8 +455,11 @@ class FreeModelEstimator:
         return self._collect(state, step_input, received)[0], None
 
     def _has_heights_since(self, t_ns: int, state: FreeModelState) -> bool:
-        """Whether heights of every strut have come since a time."""
-        return min([observer.measured_ns for observer in state.observers]) > t_ns
+        """Whether the model runs, and heights of every strut have come since a time."""
+        return (
+            state.model is not None
+            and min([observer.measured_ns for observer in state.observers]) > t_ns
+        )
 
     def _recent_instants(
         self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant

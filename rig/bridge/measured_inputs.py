@@ -22,14 +22,24 @@ from rig.bridge.tracked_motion import (
 )
 from rig.channels.channel import Channel, Sample
 
-StateT = TypeVar("StateT")
-
 _LONGEST_GAP = 10
 """Intervals after which a motion is followed from the next position on, as from the first."""
 
 
+class InputState(Protocol):
+    """What is known of an input, frozen."""
+
+    @property
+    def t_ns(self) -> int:
+        """Time of its newest sample."""
+        ...
+
+
+StateT = TypeVar("StateT", bound=InputState)
+
+
 class MeasuredInput(Protocol[StateT]):
-    """An input of the model. Its states are frozen; None stands for nothing measured."""
+    """An input of the model. None stands for the state of one of which nothing is measured."""
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -42,10 +52,6 @@ class MeasuredInput(Protocol[StateT]):
 
     def values(self, state: StateT | None, t_ns: int) -> tuple[float, ...]:
         """Its part of the input vector at a time (see `dart_model.plant.inputs`)."""
-        ...
-
-    def measured_ns(self, state: StateT) -> int:
-        """Time of its newest sample."""
         ...
 
     def is_ready(self, state: StateT | None) -> bool:
@@ -75,9 +81,6 @@ class HeldInput:
         del t_ns
         return (0.0,) if state is None else (state.value,)
 
-    def measured_ns(self, state: Sample) -> int:
-        return state.t_ns
-
     def is_ready(self, state: Sample | None) -> bool:
         return state is not None or self.channel is None
 
@@ -87,6 +90,10 @@ class Followed(Struct, frozen=True, gc=False):
 
     motion: TrackedMotion
     since_ns: int
+
+    @property
+    def t_ns(self) -> int:
+        return self.motion.measured_ns
 
 
 @dataclass(frozen=True)
@@ -110,7 +117,7 @@ class MovedInput:
         if self.acceleration is not None and sample.channel == self.acceleration.index:
             return state and replace(state, motion=accelerate(state.motion, sample))
         interval_ns = self.position.interval_ns
-        if state is None or sample.t_ns - state.motion.measured_ns > _LONGEST_GAP * interval_ns:
+        if state is None or sample.t_ns - state.t_ns > _LONGEST_GAP * interval_ns:
             return Followed(TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns), sample.t_ns)
         update = update_motion if self.acceleration is None else update_with_acceleration
         return replace(state, motion=update(state.motion, sample, self.settling_s))
@@ -118,13 +125,10 @@ class MovedInput:
     def values(self, state: Followed | None, t_ns: int) -> tuple[float, float, float]:
         return (0.0, 0.0, 0.0) if state is None else predict_motion(state.motion, t_ns)
 
-    def measured_ns(self, state: Followed) -> int:
-        return state.motion.measured_ns
-
     def is_ready(self, state: Followed | None) -> bool:
         if state is None:
             return False
-        return state.motion.measured_ns - state.since_ns >= SETTLED * self.settling_s * 1e9
+        return state.t_ns - state.since_ns >= SETTLED * self.settling_s * 1e9
 
 
 def grace_ns(item: AnyInput, stale_after_ns: int) -> int:
