@@ -64,4 +64,5 @@ DELAY = Effect(
     bounds=within(delay_s=lambda m: (0.0, 200.0 * m.step_s)),
     benches=("force_given",),
     shown=("delay_s",),
+    linear=True,
 )

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from dart_model.spec import ModelSpec
 from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given
 from rig.diagnosis.numerics.compiled import SLOTS
@@ -189,7 +191,9 @@ def first_fits(problem: Problem) -> tuple[Fit, Fit]:
     """
     base, given = nominal(problem), fit_as_given(problem)
     free = free_linear(problem, base)
-    near = fit(problem, given.model, free, Effort(12), most_level=1.0) or given
+    expected = given.parts._replace(linear=np.array([p.expected for p in problem.linear]))
+    begun = CandidateModel(base, expected)
+    near = fit(problem, begun, free, Effort(12), most_level=1.0) or given
     first = CandidateModel(base, near.parts)
     return given, fit(problem, first, free, Effort(12)) or near
 

@@ -51,6 +51,30 @@ class LinearCorrection:
 
 
 @dataclass(frozen=True)
+class ChannelCorrection:
+    """What the data correct in the measurement.
+
+    Attributes:
+        channel: Column of the recordings, as ``height_m:strut``.
+        parameter: ``delay_s``: by how much later the channel shows what is true than the first
+            input of a driven bench, or than the height where the motion is prescribed.
+        nominal: What the recordings were corrected by already.
+        total: Its value by the data.
+    """
+
+    channel: str
+    parameter: str
+    nominal: float
+    total: Estimate
+
+    @property
+    def is_late(self) -> bool:
+        """Whether it is later, or earlier, than it was taken for."""
+        low, high = self.total.low, self.total.high
+        return low is not None and high is not None and not low <= self.nominal <= high
+
+
+@dataclass(frozen=True)
 class FoundEffect:
     """An effect that the nominal model lacks.
 
@@ -212,6 +236,7 @@ class Diagnosis:
         runs: Names of the recordings that were learnt from.
         model: Name of the nominal model.
         damper: Forces of the dampers that laws describe, by velocity; empty without such a law.
+        channels: Corrections of the measurement.
     """
 
     verdict: Verdict
@@ -228,6 +253,7 @@ class Diagnosis:
     runs: tuple[str, ...]
     model: str
     damper: tuple[DamperForce, ...] = ()
+    channels: tuple[ChannelCorrection, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The outcome of a search, put together: effects, intervals, figures, corrected model."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from dart_model.effects import CATALOGUE, effect
 from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
+    ChannelCorrection,
     Diagnosis,
     Estimate,
     ExistingEffect,
@@ -23,6 +25,7 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
+from rig.diagnosis.problem.channel_delays import is_undetermined
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
@@ -58,6 +61,9 @@ _NEARLY = 0.02
 _CLOCK = 5e-5
 """Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
 run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
+_OF_SAMPLING = 0.01
+"""Half-width that the interval of a delay has at least, as a share of the time between samples:
+between them the motion is a cubic, and a law that switches is not."""
 _HOLD = 0.3
 """Share of half a sampling interval within which a delay may be that of a zero-order hold."""
 
@@ -129,7 +135,7 @@ def compose_result(
     diagnosis = Diagnosis(
         verdict,
         linear_corrections(problem, estimates),
-        _effects(problem, estimates, after) or _linear_effects(problem, estimates, after),
+        _effects(problem, estimates, after) + _linear_effects(problem, estimates, after),
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
         _other_families(search) if ambiguous else (),
@@ -151,6 +157,7 @@ def compose_result(
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
         damper_forces(problem, chosen, estimates.covariance, after),
+        channel_corrections(problem, estimates),
     )
     models = search.given.model, chosen.model
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)
@@ -165,6 +172,8 @@ def compose_result(
 def _other_families(search: SearchResult) -> tuple[str, ...]:
     """Families of the rivals that the chosen model lacks."""
     rivals = [effect(name).family for r in search.rivals for _, name in r.fit.candidate.new]
+    if any(r.fit.candidate == search.chosen.fit.candidate for r in search.rivals):
+        rivals.append("delay")
     chosen = set(search.chosen.families)
     return tuple(dict.fromkeys(family for family in rivals if family not in chosen))
 
@@ -173,6 +182,8 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
     """The linear parameters that a fit left free, with their intervals."""
     corrections: list[LinearCorrection] = []
     for variable, p in enumerate(_free(problem, estimates.fit)):
+        if p.kind == "delay":
+            continue
         nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
         about = p.kind in ("stiffness", "preload")
         corrections.append(
@@ -184,6 +195,28 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
                 mid_stroke_m(problem.motions[p.strut]) if about else None,
             )
         )
+    return tuple(corrections)
+
+
+def channel_corrections(problem: Problem, estimates: FitEstimates) -> tuple[ChannelCorrection, ...]:
+    """The delays that a fit left free, with their intervals.
+
+    A delay at the end of its range is not what the data determine.
+    """
+    least_s = _OF_SAMPLING * max(grid.step_s for grid in problem.grids)
+    space, corrections = estimates.fit.space, list[ChannelCorrection]()
+    for i, p in enumerate(_free(problem, estimates.fit)):
+        if p.kind != "delay" or is_undetermined(p):
+            continue
+        found = estimates.estimate(i, p.nominal)
+        value = found.value - p.nominal
+        is_at_end = min(value - space.low[i], space.high[i] - value) < _AT_BOUND * abs(value)
+        if found.low is None or found.high is None or is_at_end:
+            found = Estimate(found.value, None, None)
+        else:
+            halves = [math.hypot(end - found.value, least_s) for end in (found.low, found.high)]
+            found = Estimate(found.value, found.value - halves[0], found.value + halves[1])
+        corrections.append(ChannelCorrection(p.channel, PARAMETERS[p.kind], p.nominal, found))
     return tuple(corrections)
 
 
@@ -248,13 +281,18 @@ def estimates_of(
 def _linear_effects(
     problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    """Linear corrections as effects, where there are no others."""
+    """Delays as effects, and where there are no laws, all linear corrections."""
     result = estimates.fit
+    late = {item.channel for item in channel_corrections(problem, estimates) if item.is_late}
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)
     implied = _find_preload_of_springs(problem, estimates)
     for variable, (index, p) in enumerate(zip(indices, _free(problem, result), strict=True)):
-        if variable in implied or p.kind not in EFFECTS:
+        if p.kind == "delay":
+            is_effect = p.channel in late
+        else:
+            is_effect = not result.candidate.new and p.kind in EFFECTS and variable not in implied
+        if not is_effect:
             continue
         linear = result.parts.linear.copy()
         linear[index] = 0.0
@@ -342,6 +380,8 @@ def _suggestion(search: SearchResult) -> str:
     """A recording that would distinguish the chosen model and its rivals."""
     models = [search.chosen, *search.rivals]
     names = [name for model in models for _, name in model.fit.candidate.new]
+    if any(rival.fit.candidate == search.chosen.fit.candidate for rival in search.rivals):
+        names.append("delay")
     excitations = dict.fromkeys(effect(name).excitation for name in names)
     return "a run with " + "; and ".join(excitations)
 
@@ -539,8 +579,7 @@ def find_friction_n(force_n: Array, velocity_m_per_s: Array) -> float | None:
 def _resembles_hold(problem: Problem, result: Fit) -> bool:
     """Whether there is a delay that a zero-order hold of the applied force would cause."""
     half_s = 0.5 * problem.motions[0].step_s
-    slots = slots_of(problem, result.candidate).each[len(result.candidate.kept) :]
     return any(
-        name == "delay" and abs(result.parts.effects[slot.parameters][0] / half_s - 1.0) < _HOLD
-        for (_, name), slot in zip(result.candidate.new, slots, strict=True)
+        p.kind == "delay" and abs(float(change) / half_s - 1.0) < _HOLD
+        for p, change in zip(problem.linear, result.parts.linear, strict=True)
     )

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.problem import linear_part, track
+from rig.diagnosis.problem.channel_delays import delay_parameters
+from rig.diagnosis.problem.delay_estimate import with_estimated_delays
 from rig.diagnosis.problem.drive import drive_of_recording
 from rig.diagnosis.problem.free_run import FreeRunProblem
 from rig.diagnosis.problem.grid import SmoothRecording, smooth_recording, strut_motions
@@ -96,9 +98,10 @@ def build(
     masses = [linear_part.moving_mass_kg(mechanism, i) for i in range(len(motions))]
     motions = tuple(m._replace(mass_kg=mass) for m, mass in zip(motions, masses, strict=True))
     linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism, drive)
+    linear += delay_parameters(spec, first.recording)
     existing = track.existing_effects(spec, [recording.motion for recording in smooth])
     basis = ProblemBasis(spec, linear, existing, motions, block_s, plants)
-    return _divide_at_gaps(kind.of_recordings(basis, smooth), smooth)
+    return with_estimated_delays(_divide_at_gaps(kind.of_recordings(basis, smooth), smooth))
 
 
 def _smooth(

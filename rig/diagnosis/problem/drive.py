@@ -67,6 +67,14 @@ class Drive(NamedTuple):
         """Input vector at some times, shape (len(t_s), inputs)."""
         return np.hstack([item.at(t_s) for item in self.inputs])
 
+    def before_delays(self, t_s: Array, delays_s: Array) -> Array:
+        """Input vector at some times where each input was measured a delay too late.
+
+        Beyond the recording it stays as it is at the end.
+        """
+        times = (np.clip(t_s + delay_s, t_s[0], t_s[-1]) for delay_s in delays_s.tolist())
+        return np.hstack([item.at(own) for item, own in zip(self.inputs, times, strict=True)])
+
     @property
     def has_force(self) -> bool:
         """Whether a force or torque is among them, which gives forces and masses their scale."""

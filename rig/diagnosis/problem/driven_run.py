@@ -81,6 +81,14 @@ class DrivenRun(NamedTuple):
         moved = _moved(self.drive, self.mechanism, fine)
         return self._replace(fine=fine, moved=moved, substeps=steps, angle=0.5 * self.angle)
 
+    def before_delays(self, delays_s: Array) -> "DrivenRun":
+        """The recording with its inputs as they were, measured with a delay each, (inputs,)."""
+        if not np.any(delays_s):
+            return self
+        times = fine_times(self.grid.t_s, 2 * self.substeps)
+        fine = np.ascontiguousarray(self.drive.before_delays(times, delays_s))
+        return self._replace(fine=fine, moved=_moved(self.drive, self.mechanism, fine))
+
     def disturbed(self, noise: Array) -> "DrivenRun":
         """The recording with other inputs, the difference given as `fine`."""
         fine = self.fine + noise

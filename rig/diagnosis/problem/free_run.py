@@ -23,6 +23,13 @@ from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, T
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
+from rig.diagnosis.problem.channel_delays import (
+    Delays,
+    LateReader,
+    delays_of,
+    known_share,
+    late_columns,
+)
 from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
 from rig.diagnosis.problem.driven_run import DrivenRun, driven_run, first_motion, track_of
 from rig.diagnosis.problem.grid import (
@@ -68,6 +75,10 @@ the largest counts, since a lightly damped motion answers to it in so few indepe
 their RMS scatters by a third."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
 """Share of the noise, or of the error if that is more, to which DART's steps are refined."""
+_DELAY_STEP_S = 1e-5
+"""Step of the difference quotient by the delay of an input."""
+_ORDER = 4
+"""Columns of a smoothed signal: itself and three derivatives."""
 _IMPLAUSIBLE = 5.0
 """Times the largest deflection that the load could cause from which on columns are mixed up."""
 
@@ -170,6 +181,21 @@ class FreeRunProblem(Problem):
             np.concatenate([np.ones(2 * n, dtype=np.bool_), fitted]),
         )
 
+    # --- delays -----------------------------------------------------------------------------------
+
+    def _delays(self, model: CandidateModel) -> Delays:
+        inputs = len(self.runs[0].drive.inputs)
+        return delays_of(self.linear, model.parts.linear, len(self.noise_m), inputs)
+
+    def _seen(self, k: int, model: CandidateModel, motion: Trajectory) -> Array:
+        """Heights of a simulated motion as delayed sensors show them, shape (N, struts)."""
+        t_s, delays_s = self.runs[k].grid.t_s, self._delays(model).struts
+        return late_columns(t_s, motion.heights_m, motion.velocities_m_per_s, delays_s)
+
+    def _before_delays(self, k: int, model: CandidateModel) -> DrivenRun:
+        """A recording with its inputs as they were before their delays."""
+        return self.runs[k].before_delays(self._delays(model).inputs)
+
     # --- the residual in simulation ---------------------------------------------------------------
 
     def simulate(self, run: DrivenRun, model: CandidateModel, start: Array) -> Trajectory | None:
@@ -204,11 +230,14 @@ class FreeRunProblem(Problem):
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Measured less simulated heights over the noise, at the fitted nodes, flat."""
-        run = self.runs[k]
+        run, delays_s = self._before_delays(k, model), self._delays(model).struts
         motion = self.simulate(run, model, model.parts.starts[k])
         if motion is None:
             return None
-        return ((run.grid.heights_m - motion.heights_m)[run.grid.fitted] / self.noise_m).ravel()
+        residual = run.grid.heights_m - self._seen(k, model, motion)
+        if np.any(delays_s):
+            residual *= known_share(run.grid.t_s, delays_s)
+        return (residual[run.grid.fitted] / self.noise_m).ravel()
 
     def states(self, k: int, model: CandidateModel) -> Array:
         return model.parts.starts[k][2 * self.runs[k].mechanism.coordinates :]
@@ -222,10 +251,13 @@ class FreeRunProblem(Problem):
         estimate is nearest.
         """
         variances: list[Array] = []
-        for run, start in zip(self.runs, model.parts.starts, strict=True):
+        for k, start in enumerate(model.parts.starts):
+            run = self._before_delays(k, model)
             motion = self.simulate(run, model, start)
             heights = run.grid.heights_m
-            reference = np.nanmean(heights, axis=0) if motion is None else motion.heights_m
+            reference = np.nanmean(heights, axis=0)
+            if motion is not None:
+                reference = self._seen(k, model, motion)
             residual = heights - reference
             variances.append(
                 np.array([estimate_noise(run.grid.t_s, column).variance for column in residual.T])
@@ -247,7 +279,7 @@ class FreeRunProblem(Problem):
 
         Each of shape (N, struts); an empty list where there is no noise, or the model runs away.
         """
-        run, start = self.runs[k], model.parts.starts[k]
+        run, start = self._before_delays(k, model), model.parts.starts[k]
         stds = self._input_noise[k]
         motion = self.simulate(run, model, start) if any(stds) else None
         if motion is None:
@@ -270,12 +302,12 @@ class FreeRunProblem(Problem):
 
     def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """The force that would make the residual vanish, along the smoothed motion."""
-        run, parts = self.runs[k], model.parts
+        run, parts = self._before_delays(k, model), model.parts
         motion = self.simulate(run, model, parts.starts[k])
         m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
         if motion is None or m is None:
             return None
-        residual, _ = run.grid.residual_states(motion.heights_m)
+        residual = self._residual_states(k, model, motion)
         z, w, a = (
             b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(motion)
         )
@@ -290,6 +322,17 @@ class FreeRunProblem(Problem):
         )
         return ResidualForces(run.grid.name, along, needed.T - forces, deviation.T)
 
+    def _residual_states(self, k: int, model: CandidateModel, motion: Trajectory) -> list[Smoothed]:
+        """Measured less simulated motion, smoothed, before the sensors' delays."""
+        grid, delays_s = self.runs[k].grid, self._delays(model).struts
+        states, _ = grid.residual_states(self._seen(k, model, motion))
+        return [
+            item._replace(
+                states=late_columns(grid.t_s, item.states, None, np.full(_ORDER, -delay_s))
+            )
+            for item, delay_s in zip(states, delays_s.tolist(), strict=True)
+        ]
+
     # --- the regression along the motion ----------------------------------------------------------
 
     def segments(
@@ -302,29 +345,55 @@ class FreeRunProblem(Problem):
         """
         samples = sum(len(run.grid.t_s) for run in self.runs)
         segments: list[Segment] = []
-        for k, run in enumerate(self.runs):
+        for k in range(self.recordings):
+            run = self._before_delays(k, model)
             motion = self.simulate(run, model, model.parts.starts[k])
             if motion is None:
                 raise FloatingPointError(run.grid.name)
-            residual, _ = run.grid.residual_states(motion.heights_m)
+            residual = self._residual_states(k, model, motion)
             pieces = track.pieces(len(run.grid.t_s), samples, most_samples, largest_stride)
             lead = _whole_motions(run, motion, residual) if len(pieces) > 1 else None
+            seen = self._seen(k, model, motion), self._by_input_delays(k, model, motion)
             segments += [
-                self._segment(run, motion, residual, lead, cut, model.parts.linear)
+                self._segment(run, motion, seen, residual, lead, cut, model)
                 for cut in pieces
                 if np.any(run.grid.fitted[cut])
             ]
         return tuple(segments)
 
+    def _by_input_delays(
+        self, k: int, model: CandidateModel, motion: Trajectory
+    ) -> dict[int, Array]:
+        """Derivative of the seen heights (N, struts) by the delay of each input that has one.
+
+        Raises:
+            FloatingPointError: The model runs away.
+        """
+        changes: dict[int, Array] = {}
+        for index, parameter in enumerate(self.linear):
+            if parameter.kind != "delay" or parameter.input < 0:
+                continue
+            linear = model.parts.linear.copy()
+            linear[index] += _DELAY_STEP_S
+            later = model._replace(parts=model.parts._replace(linear=linear))
+            moved = self.simulate(self._before_delays(k, later), later, later.parts.starts[k])
+            if moved is None:
+                raise FloatingPointError(self.runs[k].grid.name)
+            change = self._seen(k, model, moved) - self._seen(k, model, motion)
+            changes[index] = change / _DELAY_STEP_S
+        return changes
+
     def _segment(
         self,
         run: DrivenRun,
         simulated: Trajectory,
+        seen: tuple[Array, dict[int, Array]],
         residual: Sequence[Smoothed],
         lead: tuple[Track, Track] | None,
         cut: slice,
-        linear: Array,
+        model: CandidateModel,
     ) -> Segment:
+        linear, delays_s = model.parts.linear, self._delays(model).struts
         m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
         if m is None:
             raise FloatingPointError(run.grid.name)
@@ -343,26 +412,37 @@ class FreeRunProblem(Problem):
         temperature_c = np.interp(t_s, grid.t_s, grid.temperature_c)
         along = Track.of_columns(t_s, z, w, applied, temperature_c)
         rows = np.flatnonzero(grid.fitted[cut])
-        every = dynamics.finer
-        weight = 1.0 / self.noise_m
+        read = LateReader(t_s, grid.t_s[cut][rows], delays_s)
+        weight = known_share(grid.t_s, delays_s)[cut][rows] / self.noise_m
+
+        def whiten(heights_m: Array) -> Array:
+            """Heights (N, struts) as they are seen, whitened, shape (m,)."""
+            return (read(heights_m) * weight).ravel()
 
         def whiten_heights(forces: Array) -> Array:
             """Whitened heights (m,) under generalised forces (N, n)."""
-            return (dynamics.heights(forces)[rows * every] * weight).ravel()
+            return whiten(dynamics.heights(forces))
 
         mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s, inputs)
 
         def respond_to(strut: int, force: Array) -> Array:
             return whiten_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
 
-        raw = grid.heights_m[cut] - simulated.heights_m[cut]
+        raw = grid.heights_m[cut] - seen[0][cut]
         held = dynamics.holding_forces(states[0], states[1], grid.t_s[cut], t_s)
         target = (raw[rows] * weight).ravel() - whiten_heights(held)
-        columns = [
-            whiten_heights(mechanism.unit_force(parameter, along, acceleration, self.motions))
-            for parameter in self.linear
-        ]
-        initial = [(h[rows * every] * weight).ravel() for h in dynamics.free_motions(len(t_s))]
+        columns: list[Array] = []
+        for index, parameter in enumerate(self.linear):
+            if parameter.kind != "delay":
+                force = mechanism.unit_force(parameter, along, acceleration, self.motions)
+                columns.append(whiten_heights(force))
+            elif index in seen[1]:
+                columns.append((seen[1][index][cut][rows] * weight).ravel())
+            else:
+                late = np.zeros_like(w)
+                late[:, parameter.strut] = -w[:, parameter.strut]
+                columns.append(whiten(late))
+        initial = [whiten(heights_m) for heights_m in dynamics.free_motions(len(t_s))]
         numbers = block_numbers(grid.t_s, self.block_s)[cut][rows]
         blocks = np.repeat(numbers - numbers[0], len(self.noise_m))
         reference = along._replace(
@@ -392,23 +472,38 @@ class FreeRunProblem(Problem):
         run = self.runs[k]
         grid, rows = run.grid, select_nodes(run.grid, blocks=blocks)
         measured = np.where(rows[:, np.newaxis], grid.heights_m, np.nan)
-        simulated = [self.simulate(run, model, model.parts.starts[k]) for model in models]
+        simulated = [
+            self.simulate(self._before_delays(k, model), model, model.parts.starts[k])
+            for model in models
+        ]
         motions = [motion for motion in simulated if motion is not None]
         if len(motions) < len(models):
             raise RecordingError(
                 f"{grid.name}: the model runs away on this run, expected one that stays near the "
                 "motion it was learnt from"
             )
-        before, linear, after = motions
+        before, _, after = motions
+        seen_m = [
+            self._seen(k, model, motion) for model, motion in zip(models, motions, strict=True)
+        ]
+        shares = [known_share(grid.t_s, self._delays(model).struts) for model in models]
+        measured = np.where(np.min(shares, axis=0) == 1.0, measured, np.nan)
         noise = np.sqrt(
-            [estimate_noise(grid.t_s, c).variance for c in (grid.heights_m - after.heights_m).T]
+            [estimate_noise(grid.t_s, c).variance for c in (grid.heights_m - seen_m[2]).T]
         )
         on_dart_m: list[Array] = []
-        for model, motion in ((models.nominal, before), (models.corrected, after)):
-            error_m = rms(measured - motion.heights_m)
+        for model, motion, heights_m in (
+            (models.nominal, before, seen_m[0]),
+            (models.corrected, after, seen_m[2]),
+        ):
+            error_m = rms(measured - heights_m)
             tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
             start, expected_m = model.parts.starts[k], motion.heights_m
-            on_dart_m.append(on_dart.dart_heights(self, run, model, start, expected_m, tolerance_m))
+            found_m = on_dart.dart_heights(
+                self, self._before_delays(k, model), model, start, expected_m, tolerance_m
+            )
+            delays_s = self._delays(model).struts
+            on_dart_m.append(late_columns(grid.t_s, found_m, None, delays_s))
         forces = [self.residual_forces(k, model) for model in models]
         residual_n = [
             np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces
@@ -433,7 +528,7 @@ class FreeRunProblem(Problem):
             self._cell_errors(k, models, (before, after), rows),
         )
         return RunEvaluation(
-            figures, heights, rms(measured - linear.heights_m), residual_n[1],
+            figures, heights, rms(measured - seen_m[1]), residual_n[1],
             NoiseFloor(floor_m, deviation), drift_m, series,
         )  # fmt: skip
 
@@ -449,7 +544,8 @@ class FreeRunProblem(Problem):
         cells = np.where(evaluated[:, np.newaxis], cells_n, np.nan)
         errors: list[float] = []
         for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
-            forces = track.strut_forces(self, model, track_of(motion, run), self.states(k, model))
+            along = track_of(motion, self._before_delays(k, model))
+            forces = track.strut_forces(self, model, along, self.states(k, model))
             at = np.column_stack([np.interp(t_s, run.grid.t_s, force) for force in forces])
             errors.append(rms(cells - at))
         return BeforeAfter(*errors)

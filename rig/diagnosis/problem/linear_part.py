@@ -38,6 +38,7 @@ PARAMETERS = {
     "preload": "preload_n",
     "gain": "input_gain",
     "free_length": "free_length_m",
+    "delay": "delay_s",
 }
 """Kinds as they are called in a diagnosis and in a model's `tolerance`."""
 EFFECTS = {
@@ -46,6 +47,7 @@ EFFECTS = {
     "damping": "linear_damping",
     "preload": "preload",
     "gain": "input_gain",
+    "delay": "delay",
 }
 """Effects that stand for a change of each."""
 
@@ -168,6 +170,8 @@ def spec_with_linear_changes(
                 spec = _with_preload(spec, strut.name, change)
             case "mass":
                 spec = _with_mass(spec, strut.name, change)
+            case "delay":
+                continue  # One of the measurement.
             case "free_length":
                 spec = _with_field(spec, strut.name, "free_length_m", change)
                 spec = _with_preload(spec, strut.name, -strut.stiffness_n_per_m * change)

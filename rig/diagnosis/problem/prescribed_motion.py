@@ -17,6 +17,7 @@ from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, track
+from rig.diagnosis.problem.channel_delays import delays_of, known_share, late_rows
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
     SmoothRecording,
@@ -64,6 +65,7 @@ class DynoRun(NamedTuple):
 
     Attributes:
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
+        cell_rates_n_per_s: Their smoothed rates of change, shape (struts, N).
         certain: Nodes at which the motion is well known, shape (N,).
         height_noise_m: Standard deviation of each height's noise, shape (struts,).
         velocity_noise_m_per_s: Standard deviation of each smoothed velocity, shape (struts,).
@@ -73,6 +75,7 @@ class DynoRun(NamedTuple):
     grid: RecordingGrid
     along: Track
     cells_n: Array
+    cell_rates_n_per_s: Array
     certain: Flags
     height_noise_m: Array
     velocity_noise_m_per_s: Array
@@ -89,6 +92,7 @@ class DynoRun(NamedTuple):
             grid=self.grid.cut(nodes),
             along=self.along.cut(nodes),
             cells_n=self.cells_n[:, nodes],
+            cell_rates_n_per_s=self.cell_rates_n_per_s[:, nodes],
             certain=self.certain[nodes],
         )
 
@@ -98,16 +102,20 @@ def dyno_run(smooth_recording: SmoothRecording) -> DynoRun:
     recording, grid, sample_nodes, motion, states, noises = smooth_recording
     spread = np.array([s.deviations[:, 1] for s in states])
     cells = np.full((len(states), len(grid.t_s)), np.nan)
+    rates = cells.copy()
     noise_n = np.full(len(states), np.nan)
     measured = recording.strut_forces_n
     for i in range(len(states)):
         if measured is not None and np.all(np.isfinite(measured[:, i])):
             cells[i] = np.interp(grid.t_s, grid.t_s[sample_nodes], measured[:, i])
-            noise_n[i] = np.sqrt(estimate_noise(grid.t_s, cells[i]).variance)
+            noise = estimate_noise(grid.t_s, cells[i])
+            noise_n[i] = np.sqrt(noise.variance)
+            rates[i] = smooth(grid.t_s, cells[i] - cells[i].mean(), noise).states[:, 1]
     return DynoRun(
         grid,
         motion,
         cells,
+        rates,
         np.all(spread < _UNCERTAIN * np.median(spread, axis=1, keepdims=True), axis=0),
         np.sqrt([noise.variance for noise in noises]),
         np.median(spread, axis=1),
@@ -201,10 +209,18 @@ class PrescribedProblem(Problem):
     def states(self, k: int, model: CandidateModel) -> Array:
         return model.parts.starts[k]
 
+    def _delays_s(self, model: CandidateModel) -> Array:
+        """Delay of each load cell, shape (struts,)."""
+        return delays_of(self.linear, model.parts.linear, len(self.noise_n), 0).struts
+
     def _residual_n(self, k: int, model: CandidateModel) -> Array:
-        """Load cells less the model's forces, shape (struts, N)."""
-        run = self.runs[k]
-        return run.cells_n - track.strut_forces(self, model, run.along, model.parts.starts[k])
+        """Load cells less the model's forces as the cells show them, shape (struts, N)."""
+        run, delays_s = self.runs[k], self._delays_s(model)
+        forces = track.strut_forces(self, model, run.along, model.parts.starts[k])
+        residual_n = run.cells_n - late_rows(run.along.t_s, forces, delays_s)
+        if np.any(delays_s):
+            residual_n *= known_share(run.along.t_s, delays_s).T
+        return residual_n
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Load cells less the model's forces over the noise, at the fitted nodes, flat."""
@@ -224,9 +240,11 @@ class PrescribedProblem(Problem):
 
     def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """Load cells less the model's forces along the smoothed motion."""
-        residual_n = self._residual_n(k, model)
+        run, delays_s = self.runs[k], self._delays_s(model)
+        forces = track.strut_forces(self, model, run.along, model.parts.starts[k])
+        residual_n = late_rows(run.along.t_s, run.cells_n, -delays_s) - forces
         deviation = np.broadcast_to(self.noise_n[:, np.newaxis], residual_n.shape)
-        return ResidualForces(self.runs[k].grid.name, self.runs[k].along, residual_n, deviation)
+        return ResidualForces(run.grid.name, run.along, residual_n, deviation)
 
     def segments(
         self, model: CandidateModel, most_samples: int, largest_stride: int
@@ -238,32 +256,35 @@ class PrescribedProblem(Problem):
             residual_n = self._residual_n(k, model)
             cuts = track.pieces(nodes[k], sum(nodes), most_samples, largest_stride)
             segments += [
-                self._segment(k, residual_n, cut) for cut in cuts if np.any(run.fit_nodes[cut])
+                self._segment(k, model, residual_n, cut)
+                for cut in cuts
+                if np.any(run.fit_nodes[cut])
             ]
         return tuple(segments)
 
-    def _segment(self, k: int, residual_n: Array, cut: slice) -> Segment:
-        run = self.runs[k]
+    def _segment(self, k: int, model: CandidateModel, residual_n: Array, cut: slice) -> Segment:
+        run, delays_s = self.runs[k], self._delays_s(model)
         whole = run.along
         along = whole.cut(cut)
         rows = np.flatnonzero(run.fit_nodes[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
 
+        shares = known_share(whole.t_s, delays_s)[cut].T
+
         def respond(strut: int, force: Array) -> Array:
             forces = np.zeros((len(self.noise_n), len(force)))
             forces[strut] = force
-            return self._whiten(forces, rows)
+            return self._whiten(shares * late_rows(along.t_s, forces, delays_s), rows)
 
-        columns = [
-            respond(
-                p.strut,
-                linear_part.strut_force(
-                    p.kind, along.heights_m[p.strut], along.velocities_m_per_s[p.strut],
-                    self.motions[p.strut],
-                ),
-            )
-            for p in self.linear
-        ]  # fmt: skip
+        columns: list[Array] = []
+        for p in self.linear:
+            z, w = along.heights_m[p.strut], along.velocities_m_per_s[p.strut]
+            force = linear_part.strut_force(p.kind, z, w, self.motions[p.strut])
+            if p.kind == "delay":
+                # By the measured rate, in which is what the model lacks; it is late already.
+                advanced = late_rows(whole.t_s, run.cell_rates_n_per_s, -delays_s)
+                force = -advanced[p.strut, cut]
+            columns.append(respond(p.strut, force))
         target = self._whiten(residual_n[:, cut], rows)
         return Segment(
             along,
@@ -282,9 +303,15 @@ class PrescribedProblem(Problem):
         """Figures of a held-out recording: forces along the smoothed motion."""
         run = self.runs[k]
         rows = select_nodes(run.grid, blocks=blocks) & run.certain
-        measured = np.where(rows, run.cells_n, np.nan)
+        shares = [known_share(run.along.t_s, self._delays_s(model)).T for model in models]
+        measured = np.where(rows & (np.min(shares, axis=0) == 1.0), run.cells_n, np.nan)
         forces = [
-            track.strut_forces(self, model, run.along, self.states(k, model)) for model in models
+            late_rows(
+                run.along.t_s,
+                track.strut_forces(self, model, run.along, self.states(k, model)),
+                self._delays_s(model),
+            )
+            for model in models
         ]
         error = BeforeAfter(rms(measured - forces[0]), rms(measured - forces[2]))
         series = tuple(

@@ -32,7 +32,7 @@ Flags = NDArray[np.bool_]
 StrutEffect = tuple[int, str]
 """Index of a strut, and the name of an effect in it."""
 
-Kind = Literal["mass", "stiffness", "damping", "preload", "gain", "free_length"]
+Kind = Literal["mass", "stiffness", "damping", "preload", "gain", "free_length", "delay"]
 
 
 class LinearParameter(NamedTuple):
@@ -43,7 +43,11 @@ class LinearParameter(NamedTuple):
             from which laws are taken, its share in the linear spring's force counts as preload.
         deviation: Standard deviation of the prior on its change.
         least: Lowest change; mass stays positive, no spring or damper turns negative.
-        input: Of a gain, the index in the input vector of what it is the gain of.
+        input: Of a gain, the index in the input vector of what it is the gain of; of an input's
+            delay, its index among the inputs.
+        channel: Of a delay, the channel that is late.
+        most: Highest change.
+        expected: Mean of the prior on the change.
     """
 
     strut: int
@@ -52,6 +56,9 @@ class LinearParameter(NamedTuple):
     deviation: float
     least: float
     input: int = -1
+    channel: str = ""
+    most: float = np.inf
+    expected: float = 0.0
 
 
 class ExistingParameters(NamedTuple):

@@ -126,8 +126,9 @@ def existing_effects(spec: ModelSpec, tracks: Sequence[Track]) -> tuple[Existing
         for item in strut.effects:
             values = tuple(item.values())
             spring = max(float(np.std(t.heights_m[i])) * strut.stiffness_n_per_m for t in tracks)
-            acting = not effect(item.name).linear and item.name != "restoring_surface"
-            if acting and item.name != "delay":
+            is_delay = item.name == "delay"
+            acting = is_delay or not (effect(item.name).linear or item.name == "restoring_surface")
+            if acting and not is_delay:
                 forces = [law_force(t, i, item.name, np.array(values), constants) for t in tracks]
                 acting = any(float(np.max(np.abs(f))) > _NEGLIGIBLE * spring for f in forces)
             existing.append(ExistingParameters(i, item.name, values, acting))

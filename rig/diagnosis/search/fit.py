@@ -32,10 +32,12 @@ from rig.diagnosis.numerics.least_squares import (
     concatenate_spaces,
     solve,
 )
+from rig.diagnosis.problem.channel_delays import LONGEST_S, is_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
     Integers,
+    LinearParameter,
     Parts,
     Problem,
     StrutEffect,
@@ -57,6 +59,10 @@ _NIL = 1e-2
 """Least scale of a parameter, as a share of the largest one of the same unit."""
 USUAL = Effort(15)
 """Fits for which nothing else is given."""
+_NEAR = 0.2
+"""Share of the range of a delay that is searched without any law: a standard deviation."""
+_WITH_MEMORY = {"hysteresis", "unmodelled_mode"}
+"""Families whose force follows the motion later, as that of a late channel does."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -150,6 +156,23 @@ def _existing_space(name: str, values: Array, free: bool) -> Space:
     return Space(low, high, np.maximum(np.abs(values), 1e-12), (low > 0.0) & free)
 
 
+def _bounds(parameter: LinearParameter, candidate: Candidate) -> tuple[float, float]:
+    """Lowest and highest change of a linear parameter in a fit of a candidate.
+
+    The first estimate of a delay is that of a strut without memory; a law that has one may itself
+    be what was taken for the delay. Without any law a delay stays near its estimate: it would
+    imitate what is missing, and laws would be sought along another motion than the measured one.
+    """
+    if parameter.kind != "delay":
+        return parameter.least, parameter.most
+    families = {effect(name).family for _, name in candidate.new}
+    if not families.isdisjoint(_WITH_MEMORY):
+        return -LONGEST_S, LONGEST_S
+    share = 1.0 if families or is_undetermined(parameter) else _NEAR
+    low, middle, high = parameter.least, parameter.expected, parameter.most
+    return middle - share * (middle - low), middle + share * (high - middle)
+
+
 class _Layout:
     """How the search variables of a fit are ordered in a model's parts."""
 
@@ -158,10 +181,11 @@ class _Layout:
         self.problem, self.candidate, self.first, self.free = problem, candidate, first, free
         linear = problem.linear
         deviation = np.array([p.deviation for p in linear])
+        bounds = [_bounds(p, candidate) for p in linear]
         spaces = [
             Space(
-                np.array([p.least for p in linear]),
-                np.full(len(linear), np.inf),
+                np.array([low for low, _ in bounds]),
+                np.array([high for _, high in bounds]),
                 deviation,
                 np.zeros(len(linear), dtype=np.bool_),
             )
@@ -199,6 +223,7 @@ class _Layout:
             last = len(self.full) - (len(self.first.starts) - 1 - k) * self.start_size
             weight[last - states : last] = 1.0 / _STATE_PRIOR
         centre = np.zeros(len(self.full))
+        centre[:linear] = [p.expected for p in self.problem.linear]
         values = [v for i in self.candidate.kept for v in self.problem.existing[i].values]
         centre[linear : linear + existing] = values
         inner = self.whole.inner(np.clip(centre, self.whole.low, self.whole.high))

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
+from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
+from rig.diagnosis.problem.channel_delays import is_undetermined
 from rig.diagnosis.problem.problem import Candidate, CandidateModel, Problem, StrutEffect, nominal
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.explore import FirstRound
@@ -72,7 +74,7 @@ def select_model(
         most_laws = chosen.size
         _attempt_plainer(pool, chosen)
     progress("comparing rivals", 0.9)
-    rivals = _rivals(pool, chosen)
+    rivals = _rivals(pool, chosen) or _rivals_of_one_frequency(pool, final)
     superfluous = _superfluous_effects(pool, chosen)
     lawless = _with_few_corrections(pool, pool.linear)[0] if final.size else final
     rejected = ()
@@ -216,6 +218,68 @@ def _superfluous_effects(pool: Pool, chosen: ValidatedModel) -> tuple[int, ...]:
     return tuple(superfluous)
 
 
+# --- recordings of one frequency --------------------------------------------------------------
+
+
+def _springs_and_dampers(pool: Pool, free: Flags) -> list[int]:
+    """Corrections of stiffness or damping among the free linear parameters (L,), by index."""
+    linear = pool.problem.linear
+    return [i for i in np.flatnonzero(free).tolist() if linear[i].kind in ("stiffness", "damping")]
+
+
+def _rivals_of_one_frequency(pool: Pool, chosen: ValidatedModel) -> tuple[ValidatedModel, ...]:
+    """A late channel, or a law with memory, that explains as much as corrections of a strut.
+
+    Along a single sine whatever is linear is a stiffness and a damping. The first estimate of the
+    delays shows whether a recording is such a one.
+    """
+    unknown = [i for i, p in enumerate(pool.problem.linear) if is_undetermined(p)]
+    corrected = _springs_and_dampers(pool, chosen.fit.free)
+    if not unknown or not corrected:
+        return ()
+    rivals = [_with_delays_instead(pool, chosen, corrected, unknown)]
+    for strut in {pool.problem.linear[i].strut for i in corrected}:
+        own = [i for i in corrected if pool.problem.linear[i].strut == strut]
+        rivals.append(_with_memory_instead(pool, chosen, own, unknown, strut))
+    return tuple(rival for rival in rivals if rival is not None)
+
+
+def _with_delays_instead(
+    pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int]
+) -> ValidatedModel | None:
+    """The chosen model with delays in place of one or all of its corrections."""
+    for dropped in (corrected, *([i] for i in corrected)):
+        linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
+        linear[list(dropped)], free[list(dropped)], free[list(unknown)] = 0.0, False, True
+        first = CandidateModel(chosen.fit.candidate, chosen.fit.parts._replace(linear=linear))
+        result = fit(pool.problem, first, free, FINAL)
+        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
+            return rival
+    return None
+
+
+def _with_memory_instead(
+    pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int], strut: int
+) -> ValidatedModel | None:
+    """The chosen model with a relaxing spring in place of a strut's corrections."""
+    linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
+    for indices in (corrected, unknown):
+        linear[list(indices)], free[list(indices)] = 0.0, False
+    law = (strut, MAXWELL.name)
+    candidate = chosen.fit.candidate.with_effects(law)
+    if candidate == chosen.fit.candidate:
+        return None
+    plain = chosen.fit._replace(
+        model=CandidateModel(chosen.fit.candidate, chosen.fit.parts._replace(linear=linear))
+    )
+    for start in MAXWELL.starts(pool.problem.motions[strut]):
+        first = model_for(pool.problem, plain, candidate, {law: np.array(start)})
+        result = fit(pool.problem, first, free, FINAL)
+        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
+            return rival
+    return None
+
+
 # --- insignificant linear corrections ---------------------------------------------------------
 
 
@@ -249,6 +313,9 @@ def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> Validat
     """A model with those of its linear corrections alone that differ from zero."""
     candidate, parts = chosen.fit.model
     significant = _significant_parameters(chosen.fit, pool.criteria.significant)
+    # Where the data do not show a delay, spring and damper are known no better than it.
+    for i, p in enumerate(pool.problem.linear):
+        significant[i] |= is_undetermined(p) and bool(_springs_and_dampers(pool, significant))
     parts = parts._replace(linear=np.where(significant, parts.linear, 0.0))
     fewer = fit(pool.problem, CandidateModel(candidate, parts), significant, FINAL)
     if fewer is not None and not pool.prefers(chosen, lean := pool.validate(fewer)):
@@ -317,7 +384,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
             changes[i], free[i] = 1.0 / (1.0 + share) - 1.0, True
         elif i in alike:
             changes[i], free[i] = 0.0, False
-        elif p.kind != "free_length":
+        elif p.kind not in ("free_length", "delay"):
             whole = p.nominal if i in scaled else 0.0
             changes[i] = (whole + changes[i]) / (1.0 + share) - whole
             free[i] |= p.kind == "preload"

@@ -170,7 +170,9 @@ class Pool:
             linear = linear + shift * np.array(shifted)
         least = np.array([p.least for p in self.problem.linear])
         candidate = base.with_effects(*screening.laws)
-        model = self._fit_starts(candidate, np.maximum(linear, least), np.concatenate(values))
+        most = np.array([p.most for p in self.problem.linear])
+        linear = np.clip(linear, least, most)
+        model = self._fit_starts(candidate, linear, np.concatenate(values))
         # Priors weigh as in the regression: a free run may begin far off with right parameters.
         self.attempt(model, effort, max(1.0, screening.cost / len(stage.target)))
 

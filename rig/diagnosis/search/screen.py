@@ -216,7 +216,8 @@ def _project_out_nuisance(
     vectors, singular, _ = np.linalg.svd(scaled, full_matrices=False)
     basis = vectors[:, singular > _RANK * singular[0]] if scaled.shape[1] else vectors[:, :0]
     deviation = np.array([problem.linear[i].deviation for i in counted])
-    y = np.concatenate([*target, -linear[counted] / deviation])
+    expected = np.array([problem.linear[i].expected for i in counted])
+    y = np.concatenate([*target, (expected - linear[counted]) / deviation])
     blocks = concatenate_blocks([segment.blocks for segment in segments])
     blocks = np.concatenate([blocks, np.zeros(len(counted), dtype=np.int64)])
     constants = strut_constants(problem, linear)

@@ -1,0 +1,162 @@
+"""How far channels are late, from the force that a measured motion takes.
+
+With the right delays the force of a strut is a function of height and velocity with dry friction,
+as far as the strut is one. So the force is fitted with such functions and with its own derivatives
+by the delays: the part of these that the functions cannot represent determines the error of the
+delays and its covariance. Repeated until it converges this is the method of Gauss and Newton.
+
+A single sine determines no delay: whatever is periodic is a function of height and velocity there.
+
+References:
+    Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973), projection of linear parameters.
+    Dahl, A solid friction model, Aerospace Corporation TOR-0158 (1968).
+    Newey, West, A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent
+    covariance matrix, Econometrica 55 (1987).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_KNOTS = 25
+"""Knots of the piecewise linear functions of height and of velocity, evenly over their ranges: a
+stop has its contact within a twenty-fourth of the stroke. Polynomials cannot bend so sharply, and a
+stop was taken for a delay of a millisecond."""
+
+_SLOW = (0.0, 3e-3, 1e-2, 3e-2)
+"""Shares of the largest velocity up to which dry friction rises, which has no knot there."""
+
+_RANK = 1e-9
+"""Eigenvalues below this share of the largest are rounding: of the functions some are alike."""
+
+_FRICTION_OF_STROKE = (1e-3, 1e-2, 5e-2)
+"""Displacements over which dry friction reverses, as shares of the stroke: presliding of tens of
+micrometres to a soft seal. Without friction among the functions, its hysteresis is taken for a
+delay."""
+
+_LEAST_SHARE = 0.1
+"""Of the derivative's power that the functions must not be able to give. Of one sine, whose start
+is in the run, they leave 0.02 and the delay comes out 2 ms wrong; of three sines 0.8, and 5 us."""
+
+
+class ForceOverTime(NamedTuple):
+    """The force that a strut takes along its measured motion.
+
+    Attributes:
+        height_m: Shape (N,).
+        velocity_m_per_s: Shape (N,).
+        force_n: With the delays as they are assumed, shape (N,).
+        by_delays: Its derivatives by them, shape (N, delays).
+        further: Other signals that the force may be proportional to, shape (N, signals).
+    """
+
+    height_m: Array
+    velocity_m_per_s: Array
+    force_n: Array
+    by_delays: Array
+    further: Array
+
+
+class DelayStep(NamedTuple):
+    """Changes of delays in s, and their standard deviations: infinite where undetermined."""
+
+    steps_s: Array
+    stds_s: Array
+
+
+def delay_step(struts: Sequence[ForceOverTime]) -> DelayStep:
+    """Errors of delays that the forces of all struts show together."""
+    residuals: list[Array] = []
+    directions: list[Array] = []
+    slopes: list[Array] = []
+    for strut in struts:
+        rows = np.column_stack([_functions(strut.height_m, strut.velocity_m_per_s), strut.further])
+        rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        values, vectors = np.linalg.eigh(rows.T @ rows)
+        kept = values > _RANK * values[-1]
+        basis = rows @ (vectors[:, kept] / np.sqrt(values[kept]))
+        both = np.column_stack([strut.force_n, strut.by_delays])
+        left = both - basis @ (basis.T @ both)
+        scale = 1.0 / max(float(np.std(left[:, 0])), 1e-300)
+        residuals.append(scale * left[:, 0])
+        directions.append(scale * left[:, 1:])
+        slopes.append(scale * strut.by_delays)
+    residual, direction = np.concatenate(residuals), np.vstack(directions)
+    power = np.sum(np.vstack(slopes) ** 2, axis=0)
+    delays = direction.shape[1]
+    steps, stds = np.zeros(delays), np.full(delays, np.inf)
+    gram = direction.T @ direction
+    own = np.array([_own_power(gram, i) for i in range(delays)])
+    known = np.flatnonzero(own > _LEAST_SHARE * power)
+    if not len(known):
+        return DelayStep(steps, stds)
+    inverse = np.linalg.inv(gram[np.ix_(known, known)])
+    steps[known] = -inverse @ (direction[:, known].T @ residual)
+    # Correlated errors: the variance of a product's sum, from its own spectrum at zero, with what
+    # the fit leaves as error.
+    errors = (residual + direction[:, known] @ steps[known])[:, np.newaxis] * direction[:, known]
+    covariance = inverse @ _long_run_covariance(errors) @ inverse
+    stds[known] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return DelayStep(steps, stds)
+
+
+def _own_power(gram: Array, i: int) -> float:
+    """Power of a direction that the others cannot give."""
+    others = [k for k in range(len(gram)) if k != i]
+    if not others:
+        return float(gram[i, i])
+    part = gram[np.ix_(others, others)]
+    shared = gram[i, others] @ np.linalg.lstsq(part, gram[others, i], rcond=None)[0]
+    return float(gram[i, i] - shared)
+
+
+def _functions(height: Array, velocity: Array) -> Array:
+    """Functions (N, functions) of height, velocity and direction."""
+    stroke_m = max(float(np.ptp(height)), 1e-12)
+    fastest = max(float(np.abs(velocity).max()), 1e-12)
+    z, v = 2.0 * (height - height.mean()) / stroke_m, velocity / fastest
+    # Each bend with the other quantity, too: a stop that damps, a damper that has zones.
+    bends = [
+        column
+        for one, other in ((z, v), (v, z))
+        for bend in (np.maximum(0.0, one - knot) for knot in _inner_knots(one))
+        for column in (bend, bend * other)
+    ]
+    rising = [np.clip(v / max(share, 1e-9), -1.0, 1.0) for share in _SLOW]
+    friction = [_friction(height, share * stroke_m) for share in _FRICTION_OF_STROKE]
+    return np.column_stack([np.ones_like(z), z, v, z * v, *bends, *rising, *friction])
+
+
+def _inner_knots(values: Array) -> Array:
+    """Knots of a piecewise linear function between its ends."""
+    return np.linspace(float(values.min()), float(values.max()), _KNOTS)[1:-1]
+
+
+def _friction(height_m: Array, reversal_m: float) -> Array:
+    """Dry friction of unit size along heights, shape (N,), after Dahl."""
+    change = np.diff(height_m)
+    kept = np.exp(-np.abs(change) / reversal_m)
+    gained = np.sign(change) * (1.0 - kept)
+    force = [0.0]
+    for keep, gain in zip(kept.tolist(), gained.tolist(), strict=True):
+        force.append(keep * force[-1] + gain)
+    return np.array(force)
+
+
+def _long_run_covariance(values: Array) -> Array:
+    """Covariance of the sums of correlated series (N, k), Bartlett weights up to a tenth of N."""
+    count = len(values)
+    lags = max(1, count // 10)
+    spectrum = np.fft.rfft(values, 2 * count, axis=0)
+    weights = 1.0 - np.arange(lags + 1) / (lags + 1)
+    covariance = np.empty((values.shape[1],) * 2)
+    for i in range(values.shape[1]):
+        for j in range(values.shape[1]):
+            products = np.fft.irfft(spectrum[:, i] * np.conj(spectrum[:, j]))
+            ahead, behind = products[: lags + 1], products[-lags:]
+            covariance[i, j] = float(weights @ ahead + weights[1:] @ behind[::-1])
+    return covariance

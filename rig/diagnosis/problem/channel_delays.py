@@ -1,0 +1,166 @@
+"""Delays of a recording's channels against its reference, as parameters of a fit.
+
+A channel that is late shows at a time what was true the delay before. The reference of a driven
+bench is its first input, that of a prescribed motion the height of the load cell's own strut: a
+delay of all channels together cannot be seen and changes nothing. What a model gives is read the
+delay earlier; the measurements stay as they are, and so does their noise.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+from dart_model.spec import ModelSpec
+from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE
+from rig.diagnosis.problem.problem import LinearParameter
+from rig.recordings.recording import Recording
+from rig.recordings.recording_checks import inputs_of
+
+Array = NDArray[np.float64]
+
+STD_S = 2e-3
+"""Standard deviation of the prior on a delay: the filter of a load cell's amplifier (a second-order
+one of 100 Hz delays by 2.3 ms), or two cycles of a bus at 1 kHz. Where the data determine a delay,
+a tenth of it or ten times as much are found alike."""
+LONGEST_S = 0.1
+"""Longest delay, either way, that is searched for."""
+UNKNOWN_S = 0.01
+"""Longest delay that is considered where the data do not show it: a fit of an unknown one would
+only replace damping."""
+
+
+class Delays(NamedTuple):
+    """Delays in s.
+
+    Attributes:
+        struts: Of each strut's height or load cell, shape (struts,).
+        inputs: Of each input of the model, shape (inputs,).
+    """
+
+    struts: Array
+    inputs: Array
+
+
+def delay_parameters(spec: ModelSpec, recording: Recording) -> tuple[LinearParameter, ...]:
+    """The delays that a recording may have, as parameters of the linear part.
+
+    A strut whose model has a `delay` of its own has that instead.
+    """
+    cells_n, delays = recording.strut_forces_n, list[LinearParameter]()
+    column = HEIGHT.column if recording.inputs else LOAD_CELL_FORCE.column
+    for index, strut in enumerate(spec.struts):
+        is_seen = recording.inputs or (cells_n is not None and np.isfinite(cells_n[:, index]).all())
+        if is_seen and not any(item.name == "delay" for item in strut.effects):
+            delays.append(_parameter(index, -1, f"{column}:{strut.name}"))
+    inputs = inputs_of(recording, spec) if recording.inputs else {}
+    for index, (name, item) in enumerate(inputs.items()):
+        if index:
+            delays.append(_parameter(0, index, f"{item.quantity.column}:{name}"))
+    return tuple(delays)
+
+
+def is_undetermined(parameter: LinearParameter) -> bool:
+    """Whether it is a delay of which the data showed nothing before the search."""
+    return parameter.kind == "delay" and parameter.most - parameter.least >= 2.0 * UNKNOWN_S
+
+
+def _parameter(strut: int, index: int, channel: str) -> LinearParameter:
+    return LinearParameter(strut, "delay", 0.0, STD_S, -UNKNOWN_S, index, channel, UNKNOWN_S)
+
+
+def delays_of(
+    parameters: Sequence[LinearParameter], changes: Array, struts: int, inputs: int
+) -> Delays:
+    """The delays among linear parameters with their changes, shape (L,)."""
+    delays = Delays(np.zeros(struts), np.zeros(inputs))
+    for parameter, change in zip(parameters, changes, strict=True):
+        if parameter.kind == "delay":
+            if parameter.input < 0:
+                delays.struts[parameter.strut] = change
+            else:
+                delays.inputs[parameter.input] = change
+    return delays
+
+
+def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array) -> Array:
+    """Columns (N, k) as they are seen with a delay (s) each, shape (k,).
+
+    Between times they are cubic, through their rates of change (N, k) where these are given.
+    """
+    late = values
+    for column, delay_s in enumerate(delays_s.tolist()):
+        if delay_s == 0.0:
+            continue
+        if late is values:
+            late = values.copy()
+        own = np.ascontiguousarray(values[:, column])
+        if rates is None:
+            course = CubicSpline(t_s, own)
+        else:
+            course = CubicHermiteSpline(t_s, own, np.ascontiguousarray(rates[:, column]))
+        late[:, column] = course(np.clip(t_s - delay_s, t_s[0], t_s[-1]))
+    return late
+
+
+def late_rows(t_s: Array, values: Array, delays_s: Array) -> Array:
+    """Rows (k, N) as they are seen with a delay (s) each: linear between times, for friction."""
+    if not np.any(delays_s):
+        return values
+    rows = [
+        row if delay_s == 0.0 else np.interp(t_s - delay_s, t_s, row)
+        for row, delay_s in zip(values, delays_s.tolist(), strict=True)
+    ]
+    return np.array(rows)
+
+
+def known_share(t_s: Array, delays_s: Array) -> Array:
+    """Weights (N, k) of rows: zero where a delay asks for what was before or after a recording.
+
+    Over the last sample they go to zero linearly, so that they have a derivative by the delay.
+    """
+    step = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    there = t_s[:, np.newaxis] - delays_s
+    return np.clip(1.0 + np.minimum(there - t_s[0], t_s[-1] - there) / step, 0.0, 1.0)
+
+
+class LateReader:
+    """Reads columns on a grid as delayed sensors show them at some times.
+
+    Args:
+        grid_s: Times of the grid, shape (N,).
+        at_s: Times that are read, among them, shape (m,).
+        delays_s: Delay of each column, shape (k,).
+    """
+
+    def __init__(self, grid_s: Array, at_s: Array, delays_s: Array) -> None:
+        self._rows = np.searchsorted(grid_s, at_s - 1e-12)
+        self._late: dict[int, tuple[NDArray[np.int64], Array]] = {}
+        for column in np.flatnonzero(delays_s).tolist():
+            late_s = np.clip(at_s - delays_s[column], grid_s[0], grid_s[-1])
+            first = np.clip(np.searchsorted(grid_s, late_s) - 2, 0, len(grid_s) - _POINTS)
+            around = first[:, np.newaxis] + np.arange(_POINTS)
+            self._late[column] = around, _lagrange_weights(grid_s[around], late_s)
+
+    def __call__(self, columns: Array) -> Array:
+        """The columns (N, k) at the times that are read, shape (m, k)."""
+        read = columns[self._rows]
+        for column, (around, weights) in self._late.items():
+            read[:, column] = np.sum(columns[around, column] * weights, axis=1)
+        return read
+
+
+_POINTS = 4
+"""Points of a cubic."""
+
+
+def _lagrange_weights(nodes: Array, at: Array) -> Array:
+    """Weights (m, k) of the values at nodes (m, k) in their polynomial's value at times (m,)."""
+    weights = np.ones_like(nodes)
+    for i in range(nodes.shape[1]):
+        for j in range(nodes.shape[1]):
+            if i != j:
+                weights[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
+    return weights
