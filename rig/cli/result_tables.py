@@ -40,6 +40,7 @@ def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
     console.print(styled(diagnosis.verdict.replace("_", " "), "bold"), end=": ")
     print_text(sentence(diagnosis, struts))
     _print_linear(diagnosis, struts=struts)
+    _print_channels(diagnosis)
     _print_effects(diagnosis, struts=struts)
     _print_damper(diagnosis, struts=struts)
     _print_held_out(diagnosis)
@@ -67,6 +68,15 @@ def _print_linear(diagnosis: "Diagnosis", *, struts: int) -> None:
         ]
         title = "Linear part" + ", to which the effects add" * bool(diagnosis.effects)
         print_table(heads, rows, title)
+
+
+def _print_channels(diagnosis: "Diagnosis") -> None:
+    from rig.pages.report.tables import channels
+    from rig.pages.report.words import reference_channel
+
+    if rows := [(f"{name} {key}", *cells) for name, key, *cells in channels(diagnosis)]:
+        heads = ("channel", "as recorded", "by the data", "95 % interval")
+        print_table(heads, rows, f"Channels, against {reference_channel(diagnosis)}")
 
 
 def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:

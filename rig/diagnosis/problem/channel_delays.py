@@ -105,17 +105,6 @@ def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array
     return late
 
 
-def late_rows(t_s: Array, values: Array, delays_s: Array) -> Array:
-    """Rows (k, N) as they are seen with a delay (s) each: linear between times, for friction."""
-    if not np.any(delays_s):
-        return values
-    rows = [
-        row if delay_s == 0.0 else np.interp(t_s - delay_s, t_s, row)
-        for row, delay_s in zip(values, delays_s.tolist(), strict=True)
-    ]
-    return np.array(rows)
-
-
 def known_share(t_s: Array, delays_s: Array) -> Array:
     """Weights (N, k) of rows: zero where a delay asks for what was before or after a recording.
 

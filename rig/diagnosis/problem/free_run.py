@@ -20,6 +20,7 @@ from dart_model.effects import Bench
 from dart_model.spec import WORLD, ModelSpec
 from rig.channels.measured_quantities import MOTION
 from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
+from rig.diagnosis.numerics.delay_step import ForceOverTime
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
@@ -75,6 +76,9 @@ the largest counts, since a lightly damped motion answers to it in so few indepe
 their RMS scatters by a third."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
 """Share of the noise, or of the error if that is more, to which DART's steps are refined."""
+_FORCE_STEP_S = 0.5e-3
+"""Step of the derivative of the force by a delay, or the time between samples, if that is longer:
+the force of a smoothed motion is rough."""
 _DELAY_STEP_S = 1e-5
 """Step of the difference quotient by the delay of an input."""
 _ORDER = 4
@@ -321,6 +325,43 @@ class FreeRunProblem(Problem):
             spread[2] @ inertia.T + constants[:, 2] * spread[1] + constants[:, 1] * spread[0]
         )
         return ResidualForces(run.grid.name, along, needed.T - forces, deviation.T)
+
+    def forces_over_time(
+        self, k: int, model: CandidateModel, delays: Sequence[int]
+    ) -> Sequence[ForceOverTime] | None:
+        """The force that the smoothed motion takes in each strut."""
+        here = self._needed_forces(k, model)
+        step_s = max(_FORCE_STEP_S, self.runs[k].grid.step_s)
+        slopes: list[Array] = []
+        for delay in delays:
+            ends: list[Array] = []
+            for sign in (1.0, -1.0):
+                linear = model.parts.linear.copy()
+                linear[delay] += sign * step_s
+                parts = model.parts._replace(linear=linear)
+                moved = self._needed_forces(k, model._replace(parts=parts))
+                if moved is None:
+                    return None
+                ends.append(moved[1])
+            slopes.append((ends[0] - ends[1]) / (2.0 * step_s))
+        if here is None:
+            return None
+        along, force_n = here
+        # A mass that is not quite known makes a force in proportion to its acceleration.
+        accelerations = np.gradient(along.velocities_m_per_s, along.t_s, axis=1).T
+        motion = zip(along.heights_m, along.velocities_m_per_s, force_n, strict=True)
+        return [
+            ForceOverTime(z, w, force, np.column_stack([it[i] for it in slopes]), accelerations)
+            for i, (z, w, force) in enumerate(motion)
+        ]
+
+    def _needed_forces(self, k: int, model: CandidateModel) -> tuple[Track, Array] | None:
+        """The smoothed motion, and the force that it takes in each strut, shape (struts, N)."""
+        residual = self.residual_forces(k, model)
+        if residual is None:
+            return None
+        law_n = track.strut_forces(self, model, residual.track, self.states(k, model))
+        return residual.track, residual.force_n + law_n
 
     def _residual_states(self, k: int, model: CandidateModel, motion: Trajectory) -> list[Smoothed]:
         """Measured less simulated motion, smoothed, before the sensors' delays."""

@@ -11,13 +11,15 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
+from rig.diagnosis.numerics.delay_step import ForceOverTime
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, track
-from rig.diagnosis.problem.channel_delays import delays_of, known_share, late_rows
+from rig.diagnosis.problem.channel_delays import delays_of, known_share
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
     SmoothRecording,
@@ -64,6 +66,7 @@ class DynoRun(NamedTuple):
     """A recording of a prescribed motion and the forces that it took.
 
     Attributes:
+        courses: Height of each strut over time, also where this is a part of a recording.
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
         cell_rates_n_per_s: Their smoothed rates of change, shape (struts, N).
         certain: Nodes at which the motion is well known, shape (N,).
@@ -74,12 +77,25 @@ class DynoRun(NamedTuple):
 
     grid: RecordingGrid
     along: Track
+    courses: tuple[CubicHermiteSpline, ...]
     cells_n: Array
     cell_rates_n_per_s: Array
     certain: Flags
     height_noise_m: Array
     velocity_noise_m_per_s: Array
     cell_noise_n: Array
+
+    def seen(self, delays_s: Array) -> Track:
+        """The motion as late load cells show its force, by the delay of each, (struts,)."""
+        along = self.along
+        if not np.any(delays_s):
+            return along
+        rows: list[tuple[Array, Array]] = []
+        for course, delay_s in zip(self.courses, delays_s.tolist(), strict=True):
+            at = np.clip(along.t_s - delay_s, course.x[0], course.x[-1])
+            rows.append((course(at), course(at, 1)))
+        heights, velocities = (np.array(part) for part in zip(*rows, strict=True))
+        return along._replace(heights_m=heights, velocities_m_per_s=velocities)
 
     @property
     def fit_nodes(self) -> Flags:
@@ -111,9 +127,11 @@ def dyno_run(smooth_recording: SmoothRecording) -> DynoRun:
             noise = estimate_noise(grid.t_s, cells[i])
             noise_n[i] = np.sqrt(noise.variance)
             rates[i] = smooth(grid.t_s, cells[i] - cells[i].mean(), noise).states[:, 1]
+    rows = zip(motion.heights_m, motion.velocities_m_per_s, strict=True)
     return DynoRun(
         grid,
         motion,
+        tuple(CubicHermiteSpline(grid.t_s, z, w) for z, w in rows),
         cells,
         rates,
         np.all(spread < _UNCERTAIN * np.median(spread, axis=1, keepdims=True), axis=0),
@@ -216,10 +234,10 @@ class PrescribedProblem(Problem):
     def _residual_n(self, k: int, model: CandidateModel) -> Array:
         """Load cells less the model's forces as the cells show them, shape (struts, N)."""
         run, delays_s = self.runs[k], self._delays_s(model)
-        forces = track.strut_forces(self, model, run.along, model.parts.starts[k])
-        residual_n = run.cells_n - late_rows(run.along.t_s, forces, delays_s)
+        along = run.seen(delays_s)
+        residual_n = run.cells_n - track.strut_forces(self, model, along, model.parts.starts[k])
         if np.any(delays_s):
-            residual_n *= known_share(run.along.t_s, delays_s).T
+            residual_n *= known_share(along.t_s, delays_s).T
         return residual_n
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
@@ -240,11 +258,24 @@ class PrescribedProblem(Problem):
 
     def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """Load cells less the model's forces along the smoothed motion."""
-        run, delays_s = self.runs[k], self._delays_s(model)
-        forces = track.strut_forces(self, model, run.along, model.parts.starts[k])
-        residual_n = late_rows(run.along.t_s, run.cells_n, -delays_s) - forces
+        residual_n, run = self._residual_n(k, model), self.runs[k]
         deviation = np.broadcast_to(self.noise_n[:, np.newaxis], residual_n.shape)
-        return ResidualForces(run.grid.name, run.along, residual_n, deviation)
+        along = run.seen(self._delays_s(model))
+        return ResidualForces(run.grid.name, along, residual_n, deviation)
+
+    def forces_over_time(
+        self, k: int, model: CandidateModel, delays: Sequence[int]
+    ) -> Sequence[ForceOverTime]:
+        """What the load cells show along the motion that they show."""
+        run, along = self.runs[k], self.runs[k].seen(self._delays_s(model))
+        forces: list[ForceOverTime] = []
+        for i in range(len(self.noise_n)):
+            own = [float(self.linear[delay].strut == i) for delay in delays]
+            by_delays = run.cell_rates_n_per_s[i, :, np.newaxis] * own
+            nothing = np.zeros((len(along.t_s), 0))
+            z, w = along.heights_m[i], along.velocities_m_per_s[i]
+            forces.append(ForceOverTime(z, w, run.cells_n[i], by_delays, nothing))
+        return forces
 
     def segments(
         self, model: CandidateModel, most_samples: int, largest_stride: int
@@ -264,7 +295,7 @@ class PrescribedProblem(Problem):
 
     def _segment(self, k: int, model: CandidateModel, residual_n: Array, cut: slice) -> Segment:
         run, delays_s = self.runs[k], self._delays_s(model)
-        whole = run.along
+        whole = run.seen(delays_s)
         along = whole.cut(cut)
         rows = np.flatnonzero(run.fit_nodes[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
@@ -274,16 +305,15 @@ class PrescribedProblem(Problem):
         def respond(strut: int, force: Array) -> Array:
             forces = np.zeros((len(self.noise_n), len(force)))
             forces[strut] = force
-            return self._whiten(shares * late_rows(along.t_s, forces, delays_s), rows)
+            return self._whiten(shares * forces, rows)
 
         columns: list[Array] = []
         for p in self.linear:
             z, w = along.heights_m[p.strut], along.velocities_m_per_s[p.strut]
             force = linear_part.strut_force(p.kind, z, w, self.motions[p.strut])
             if p.kind == "delay":
-                # By the measured rate, in which is what the model lacks; it is late already.
-                advanced = late_rows(whole.t_s, run.cell_rates_n_per_s, -delays_s)
-                force = -advanced[p.strut, cut]
+                # By the measured rate, in which is what the model lacks.
+                force = -run.cell_rates_n_per_s[p.strut, cut]
             columns.append(respond(p.strut, force))
         target = self._whiten(residual_n[:, cut], rows)
         return Segment(
@@ -305,19 +335,17 @@ class PrescribedProblem(Problem):
         rows = select_nodes(run.grid, blocks=blocks) & run.certain
         shares = [known_share(run.along.t_s, self._delays_s(model)).T for model in models]
         measured = np.where(rows & (np.min(shares, axis=0) == 1.0), run.cells_n, np.nan)
+        tracks = [run.seen(self._delays_s(model)) for model in models]
         forces = [
-            late_rows(
-                run.along.t_s,
-                track.strut_forces(self, model, run.along, self.states(k, model)),
-                self._delays_s(model),
-            )
-            for model in models
+            track.strut_forces(self, model, along, self.states(k, model))
+            for model, along in zip(models, tracks, strict=True)
         ]
         error = BeforeAfter(rms(measured - forces[0]), rms(measured - forces[2]))
         series = tuple(
             HeldOutSeries(
                 run.grid.name, self.spec.struts[i].name, "N", run.grid.t_s, measured[i],
-                forces[0][i], forces[2][i], run.along.heights_m[i], run.along.velocities_m_per_s[i],
+                forces[0][i], forces[2][i], tracks[2].heights_m[i],
+                tracks[2].velocities_m_per_s[i],
             )
             for i in range(len(measured)) if np.any(np.isfinite(measured[i]))
         )  # fmt: skip

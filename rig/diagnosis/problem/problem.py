@@ -22,6 +22,7 @@ from dart_model.effects import effect
 from dart_model.effects.law import Bench, Motion
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import Slots, slots
+from rig.diagnosis.numerics.delay_step import ForceOverTime
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem.grid import RecordingGrid, SmoothRecording, Track
 from rig.diagnosis.problem.mechanism import MechanismPlants
@@ -255,6 +256,16 @@ class Problem(ABC):
     @abstractmethod
     def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """The residual force of a recording; None where the model runs away."""
+
+    @abstractmethod
+    def forces_over_time(
+        self, k: int, model: CandidateModel, delays: Sequence[int]
+    ) -> Sequence[ForceOverTime] | None:
+        """The force of each strut along the measured motion, before the delays of a model.
+
+        `delays` are the delays by which it is differentiated, by index among the linear
+        parameters. None where the model runs away.
+        """
 
     @abstractmethod
     def residual_force_rms_n(self, mean_square: float) -> float:

@@ -22,7 +22,14 @@ from rig.pages.number_formats import (
     value_and_interval,
     with_unit,
 )
-from rig.pages.report.words import LINEAR, is_prescribed, join_words, missing
+from rig.pages.report.words import (
+    LINEAR,
+    is_prescribed,
+    join_words,
+    late_channels,
+    lateness,
+    missing,
+)
 
 _NOT_USED = "on data not used for fitting"
 _NOTHING_GAINED = 0.75
@@ -135,6 +142,7 @@ def _headline(diagnosis: Diagnosis) -> str:
         return f"{capital(join_words(names, 'and'))}{also} missing"
     parts = [_direction(item) for item in diagnosis.linear]
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
+    parts += [f"{item.channel} late" for item in late_channels(diagnosis)]
     more = "more is missing" if diagnosis.verdict == "partly_explained" else "no further effect"
     return f"{capital(join_words(parts, 'and') or 'parameters off')}; {more}"
 
@@ -168,6 +176,7 @@ def _values(diagnosis: Diagnosis) -> tuple[str, ...]:
     for item in diagnosis.linear:
         value, interval = value_and_interval(item.total, LINEAR[item.parameter][1])
         texts.append(f"{_direction(item)}: {value} (95 %: {interval})")
+    texts += [lateness(item) for item in late_channels(diagnosis)]
     return tuple(texts)
 
 

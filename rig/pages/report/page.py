@@ -26,7 +26,13 @@ from rig.pages.report.figures import (
 )
 from rig.pages.report.finding import find
 from rig.pages.report.series import check_series
-from rig.pages.report.words import BLOCKS, is_prescribed, join_words, sentence
+from rig.pages.report.words import (
+    BLOCKS,
+    is_prescribed,
+    join_words,
+    reference_channel,
+    sentence,
+)
 
 _POINTS = 4000
 _POINTS_OF_ALL = 24_000
@@ -105,6 +111,7 @@ def page(result: Result, labels: Mapping[str, str] | None = None) -> str:
         effect=effect,
         families=FAMILY_WORDS,
         percent=percent,
+        reference=reference_channel(diagnosis),
         sources=result.sources,
         split=_SPLITS[diagnosis.held_out.source],
         versions=[f"{name} {version_of(name)}" for name in _PACKAGES],
@@ -112,7 +119,7 @@ def page(result: Result, labels: Mapping[str, str] | None = None) -> str:
 
 
 def _has_corrections(diagnosis: Diagnosis) -> bool:
-    return bool(diagnosis.linear or diagnosis.effects or diagnosis.existing)
+    return bool(diagnosis.linear or diagnosis.effects or diagnosis.existing or diagnosis.channels)
 
 
 def _finding_plot(result: Result) -> Plot | None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from dart_model.effects import CATALOGUE, Effect, effect
 from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
-from rig.diagnosis.outcome import BeforeAfter, Diagnosis, Estimate, RunFigures
+from rig.diagnosis.outcome import BeforeAfter, ChannelCorrection, Diagnosis, Estimate, RunFigures
 from rig.pages.number_formats import (
     change,
     label,
@@ -111,6 +111,15 @@ def linear(diagnosis: Diagnosis) -> tuple[Row, ...]:
         values = quantity(item.nominal, unit), *value_and_interval(item.total, unit)
         rows.append((linear_label(item), item.parameter, item.strut, *values, difference(item)))
     return tuple(rows)
+
+
+def channels(diagnosis: Diagnosis) -> tuple[Row, ...]:
+    """Channel, key, nominal, value and interval of each correction of the measurement."""
+    return tuple((item.channel, item.parameter, *_delay(item)) for item in diagnosis.channels)
+
+
+def _delay(item: ChannelCorrection) -> tuple[str, str, str]:
+    return quantity(item.nominal, "s"), *value_and_interval(item.total, "s")
 
 
 def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:

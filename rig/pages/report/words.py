@@ -4,7 +4,13 @@ import math
 from collections.abc import Sequence
 
 from dart_model.effects import FAMILY_WORDS, effect
-from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection
+from rig.diagnosis.outcome import (
+    ChannelCorrection,
+    Diagnosis,
+    Estimate,
+    FoundEffect,
+    LinearCorrection,
+)
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.number_formats import (
     decimals_of,
@@ -44,11 +50,37 @@ def join_words(items: Sequence[str], last: str) -> str:
 
 
 def missing(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
-    """Missing effects, without those that are also linear corrections."""
+    """Missing effects, without those that are also corrections of linear part or channels."""
     linear = {(item.strut, item.parameter) for item in diagnosis.linear}
     return tuple(
-        item for item in diagnosis.effects if (item.strut, _AS_EFFECT.get(item.name)) not in linear
+        item
+        for item in diagnosis.effects
+        if (item.strut, _AS_EFFECT.get(item.name)) not in linear
+        and not (item.family == "delay" and diagnosis.channels)
     )
+
+
+def late_channels(diagnosis: Diagnosis) -> tuple[ChannelCorrection, ...]:
+    """Channels that the data show to be late or early."""
+    return tuple(item for item in diagnosis.channels if item.is_late)
+
+
+def reference_channel(diagnosis: Diagnosis) -> str:
+    """What delays of channels are counted from, in words."""
+    return "the height" if is_prescribed(diagnosis) else "the bench's first input"
+
+
+def lateness(item: ChannelCorrection) -> str:
+    """Channel and delay as “strut_force_n:strut is 3.10 ms late (95 %: 3.05 to 3.15 ms)”.
+
+    A recording that a delay was taken from already has the rest alone.
+    """
+    ends = [item.total.value, item.total.low, item.total.high]
+    sizes = [abs(end - item.nominal) for end in ends if end is not None]
+    value, interval = value_and_interval(Estimate(sizes[0], min(sizes), max(sizes)), "s")
+    direction = "late" if item.total.value > item.nominal else "early"
+    further = " more" if item.nominal else ""
+    return f"{item.channel} is {value}{further} {direction} (95 %: {interval})"
 
 
 def is_prescribed(diagnosis: Diagnosis) -> bool:
@@ -109,13 +141,21 @@ def _finding(diagnosis: Diagnosis, struts: int) -> str:
     lacking = missing(diagnosis)
     if lacking:
         effects = join_words([_effect(item, struts) for item in lacking], "and")
-        return _one_interval(f"The model lacks {effects}{_corrections_clause(diagnosis, struts)}")
+        clauses = _corrections_clause(diagnosis, struts) + _channels_clause(diagnosis)
+        return _one_interval(f"The model lacks {effects}{clauses}")
     parts: list[str] = []
     if diagnosis.linear:
         corrections = join_words([_linear(item, struts) for item in diagnosis.linear], "and")
         parts.append(f"linear part is off: {corrections}")
     parts += [f"effect “{item.name}” is {item.change}" for item in diagnosis.existing]
-    return _one_interval(f"The model's {'; its '.join(parts) or 'parameters are off'}")
+    channels = _channels_clause(diagnosis)
+    if channels and not parts:
+        return _one_interval(channels.removeprefix("; "))
+    return _one_interval(f"The model's {'; its '.join(parts) or 'parameters are off'}{channels}")
+
+
+def _channels_clause(diagnosis: Diagnosis) -> str:
+    return "".join(f"; {lateness(item)}" for item in late_channels(diagnosis))
 
 
 def _corrections_clause(diagnosis: Diagnosis, struts: int) -> str:
@@ -189,7 +229,7 @@ def _against_floor(value: float, floor: float, unit: str) -> str:
 
 def _error_falls(diagnosis: Diagnosis, subject: str = "") -> str:
     name, falls, _, change = _error(diagnosis)
-    corrections = len(diagnosis.linear) + len(diagnosis.existing)
+    corrections = len(diagnosis.linear) + len(diagnosis.existing) + len(late_channels(diagnosis))
     single = len(missing(diagnosis)) + corrections == 1
     if corrections:
         plain = "this correction" if single else "these corrections"
