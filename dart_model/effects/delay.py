@@ -1,7 +1,6 @@
 """Delay between the channels: the force acts later than it was recorded, or heights come late."""
 
-from dart_model.effects.law import Effect, Motion, Parameter, Rates, Start, State
-from dart_model.effects.ranges import moving, within
+from dart_model.effects.law import Effect, Parameter, Rates, State
 
 # Padé approximants of exp(-delay * s). An explicit integrator must follow their poles, so a short
 # delay, which needs no more, has a low order and one more pole.
@@ -38,11 +37,6 @@ def _pade_rates(
     return lag_2 / delay_s, lag_3 / delay_s, lag_4 / delay_s, rise
 
 
-@moving
-def _starts(motion: Motion) -> list[Start]:
-    return [(steps * motion.step_s,) for steps in (0.5, 2.0, 5.0, 15.0, 40.0)]
-
-
 DELAY = Effect(
     name="delay",
     family="delay",
@@ -60,8 +54,6 @@ DELAY = Effect(
     scaled=(),
     states=tuple(State(f"lag_{i}", 0.01) for i in (1, 2, 3, 4)),
     fits_state=True,
-    starts=_starts,
-    bounds=within(delay_s=lambda m: (0.0, 200.0 * m.step_s)),
     benches=("force_given",),
     shown=("delay_s",),
     linear=True,

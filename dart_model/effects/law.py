@@ -140,7 +140,8 @@ class Effect:
             or are overwritten by the motion are, those that add up from the beginning are not.
         adds_mass: The first parameter is a mass in kg which is added to the strut's second body
             (DART carries it, with its weight); `force` is what acts beyond that.
-        linear: Part of every model: a search corrects it and does not propose it.
+        linear: Part of every model or of every measurement: a search corrects it and does not
+            propose it.
         scaled: Indices of the parameters which, multiplied together by a factor, multiply the
             force by it; empty where there are none.
         starts: Where a search begins, for a motion; empty where the motion cannot show it.

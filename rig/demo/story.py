@@ -154,7 +154,7 @@ def run_story(
     bench = STORIES[case]
     family, effect = draw_effect(seed, case)
     plan = load_plan(CONFIGS / f"{bench.configuration}.yaml", duration_s=options.duration_s)
-    benches = [_bench(bench, effect, excitation) for excitation in (1, 2, 3)]
+    benches = [build_bench(bench, effect, excitation) for excitation in (1, 2, 3)]
 
     chapter("The bridge runs with a bench that has an undeclared effect")
     first = options.run(plan, benches[0], folder / "run", lockstep=options.lockstep)
@@ -181,7 +181,7 @@ def run_story(
     return story
 
 
-def _bench(story: StoryBench, effect: UndeclaredEffect, excitation: int) -> BenchConfig:
+def build_bench(story: StoryBench, effect: UndeclaredEffect, excitation: int) -> BenchConfig:
     """The bench with an effect, and with an excitation that a number draws."""
     bench = load_bench_config(CONFIGS / f"{story.configuration}_bench.yaml")
     update: dict[str, object] = {"undeclared_effects": (effect,), "seed": excitation}

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
+from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
@@ -25,7 +26,7 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
-from rig.diagnosis.problem.channel_delays import is_undetermined
+from rig.diagnosis.problem.channel_delays import SIGNIFICANT, is_undetermined
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
@@ -131,11 +132,13 @@ def compose_result(
     estimates = FitEstimates(chosen, fit_covariance(chosen))
     corrected = spec_with_corrections(problem, chosen.model)
     ambiguous = verdict == "ambiguous"
+    is_explained = verdict in ("explained", "ambiguous")
+    channels = channel_corrections(problem, estimates, is_explained=is_explained)
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
         verdict,
         linear_corrections(problem, estimates),
-        _effects(problem, estimates, after) + _linear_effects(problem, estimates, after),
+        _effects(problem, estimates, after) + _linear_effects(problem, estimates, after, channels),
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
         _other_families(search) if ambiguous else (),
@@ -151,13 +154,14 @@ def compose_result(
         ),
         _notes(problem, search, by_blocks=by_blocks)
         + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
+        + _notes_of_channels(channels)
         + _notes_of_bounds(problem, estimates)
         + _notes_of_friction_like_laws(problem, chosen, after)
         + _notes_of_standstill(problem, after),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
         damper_forces(problem, chosen, estimates.covariance, after),
-        channel_corrections(problem, estimates),
+        channels,
     )
     models = search.given.model, chosen.model
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)
@@ -198,15 +202,18 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
     return tuple(corrections)
 
 
-def channel_corrections(problem: Problem, estimates: FitEstimates) -> tuple[ChannelCorrection, ...]:
+def channel_corrections(
+    problem: Problem, estimates: FitEstimates, *, is_explained: bool
+) -> tuple[ChannelCorrection, ...]:
     """The delays that a fit left free, with their intervals.
 
-    A delay at the end of its range is not what the data determine.
+    A delay at the end of its range is not what the data determine. Where no model explains the
+    data, only one counts that they show without a model: another imitates what is missing.
     """
     least_s = _OF_SAMPLING * max(grid.step_s for grid in problem.grids)
     space, corrections = estimates.fit.space, list[ChannelCorrection]()
     for i, p in enumerate(_free(problem, estimates.fit)):
-        if p.kind != "delay" or is_undetermined(p):
+        if p.kind != "delay" or is_undetermined(p) or not (is_explained or p.expected):
             continue
         found = estimates.estimate(i, p.nominal)
         value = found.value - p.nominal
@@ -217,6 +224,13 @@ def channel_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Chan
             halves = [math.hypot(end - found.value, least_s) for end in (found.low, found.high)]
             found = Estimate(found.value, found.value - halves[0], found.value + halves[1])
         corrections.append(ChannelCorrection(p.channel, PARAMETERS[p.kind], p.nominal, found))
+    cells = problem.delays_of_cells(estimates.fit.model) if is_explained else {}
+    for strut, (delay_s, std_s) in cells.items():
+        if abs(delay_s) > SIGNIFICANT * std_s:
+            channel = f"{LOAD_CELL_FORCE.column}:{problem.spec.struts[strut].name}"
+            half_s = math.hypot(estimates.covariance.factor * std_s, least_s)
+            found = Estimate(delay_s, delay_s - half_s, delay_s + half_s)
+            corrections.append(ChannelCorrection(channel, PARAMETERS["delay"], 0.0, found))
     return tuple(corrections)
 
 
@@ -279,11 +293,14 @@ def estimates_of(
 
 
 def _linear_effects(
-    problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
+    problem: Problem,
+    estimates: FitEstimates,
+    after: Sequence[ResidualForces | None],
+    channels: Sequence[ChannelCorrection],
 ) -> tuple[FoundEffect, ...]:
     """Delays as effects, and where there are no laws, all linear corrections."""
     result = estimates.fit
-    late = {item.channel for item in channel_corrections(problem, estimates) if item.is_late}
+    late = {item.channel for item in channels if item.is_late}
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)
     implied = _find_preload_of_springs(problem, estimates)
@@ -479,6 +496,26 @@ def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
                 "describe the strut?"
             )
     return notes
+
+
+def _notes_of_channels(channels: Sequence[ChannelCorrection]) -> tuple[str, ...]:
+    """What to do about a late channel."""
+    notes: list[str] = []
+    for item in channels:
+        if not item.is_late:
+            continue
+        if item.total.value > 0.0:
+            what = f"state `delay_s: {item.total.value:.3g}` for it"
+        else:
+            what = (
+                f"it is early, so state `delay_s: {-item.total.value:.3g}` for the channel that it "
+                "is compared with"
+            )
+        notes.append(
+            f"{item.channel} is not simultaneous: {what} in the configuration of the bench. The "
+            "corrected model does not contain it."
+        )
+    return tuple(notes)
 
 
 def _notes_of_bounds(problem: Problem, estimates: FitEstimates) -> tuple[str, ...]:

@@ -47,6 +47,7 @@ class Recording:
             strut without a cell; None where there is no cell.
         temperature_c: Damper temperature, shape (N,), or None.
         sha256: Of the file, or of the run's steps, in hex; None where it was not read from one.
+        delays_s: Delays that its times are free of already, by channel, as ``height_m:strut``.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Recording:
     strut_forces_n: Array | None = None
     temperature_c: Array | None = None
     sha256: str | None = None
+    delays_s: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def applied_force_n(self) -> Array | None:

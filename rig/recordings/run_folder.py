@@ -14,7 +14,7 @@ from can_dbc.protection import check_crc_log
 from can_dbc.units import Dimension
 from rig.bridge.incoming_messages import compile_follower_of
 from rig.channels.channel import Channel
-from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.checksums import refuse_damage
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
@@ -67,7 +67,20 @@ def read_run(folder: Path) -> Recording:
         inputs,
         None if cell_n is None or len(heights) > 1 else cell_n[:, np.newaxis],
         _resample(payloads, temperature, t_s),
+        delays_s=_delays_s(plan, cell),
     )
+
+
+def _delays_s(plan: Plan, cell: Channel | None) -> dict[str, float]:
+    """Configured delays of what a diagnosis reads, by the names that it has for the channels."""
+    names = [strut.name for strut in plan.model.struts]
+    delays = {f"{HEIGHT.column}:{names[it.strut]}": it.delay_ns for it in plan.heights}
+    if cell is not None:
+        delays[f"{LOAD_CELL_FORCE.column}:{names[-1]}"] = cell.delay_ns
+    for item in plan.inputs:
+        if item.channel is not None:
+            delays[f"{item.channel.quantity.column}:{item.name}"] = item.channel.delay_ns
+    return {name: delay_ns * 1e-9 for name, delay_ns in delays.items() if delay_ns}
 
 
 def read_channel(run: RunFolder, channel: Channel) -> tuple[Array, Array]:
@@ -143,7 +156,7 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
         good[good] = are_timed(t_ns[good])
         times_s = np.asarray(t_ns[good] * 1e-9, dtype=np.float64)
     t_s, first = np.unique(times_s, return_index=True)
-    return t_s, values[good][first]
+    return t_s - channel.delay_ns * 1e-9, values[good][first]
 
 
 def _stamped_times_s(t_ns: NDArray[np.int64], stamps_s: Array, channel: Channel) -> Array:

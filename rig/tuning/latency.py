@@ -1,12 +1,10 @@
 """Delay of a height, from a run of the bench.
 
 The applied force arrives at once and the height late: compared with a model without the delay, the
-strut's force seems to depend on the applied force. With the right delay it is a function of height
-and of velocity with dry friction, as far as the strut is one. So the run is computed again with a
-delay, the estimated force is smoothed, and fitted with functions of height and velocity and with
-its own derivative by the delay: the part of that derivative that the functions cannot represent
-determines the error of the delay and its variance. This is repeated until it converges (Gauss and
-Newton).
+strut's force seems to depend on the applied force. So the run is computed again with a delay, the
+estimated force is smoothed, and its derivative by the delay determines the error of the delay and
+its variance, as in a diagnosis (`rig.diagnosis.numerics.delay_step`). This is repeated until it
+converges.
 
 A bench moved by a single sine does not determine the delay: whatever is periodic is a function of
 height and velocity there. Neither does a run that the observer follows for too short a time. The
@@ -21,25 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_step
 from rig.observers.kalman import KalmanObserver
 from rig.plan.plan import Plan
 from rig.run.replay import replay
 from rig.tuning.expectation import FEWEST, Array, longest_stretch, residual_force
 
-_DEGREE = 7
-"""Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
-
-_FRICTION_OF_STROKE = (1e-3, 1e-2, 5e-2)
-"""Displacements over which dry friction reverses, as shares of the stroke: presliding of tens of
-micrometres to a soft seal. Without friction among the functions, its hysteresis is taken for a
-delay of the applied force."""
-
 _ITERATIONS = 6
 """Of Gauss and Newton: three sines took three, a single sine none that helps."""
-
-_LEAST_SHARE = 0.1
-"""Of the derivative's power that the functions must not be able to give. Of one sine, whose start
-is in the run, they leave 0.02 and the delay comes out 2 ms wrong; of three sines 0.8, and 5 us."""
 
 _STEP_S = 0.5e-3
 """Step of the derivative by the delay."""
@@ -154,48 +141,9 @@ def _delay_step(here: _Series, later: _Series) -> tuple[float, float]:
         return 0.0, math.inf
     slope = np.interp(here.arrived_s, later.arrived_s, later.force_n) - here.force_n
     slope = slope / _STEP_S
-    rows = _functions(here.height_m, here.velocity_m_per_s)
-
-    def residual_of(signal: Array) -> Array:
-        return signal - rows @ np.linalg.lstsq(rows, signal, rcond=None)[0]
-
-    residual, direction = residual_of(here.force_n), residual_of(slope)
-    power = float(direction @ direction)
-    if power <= _LEAST_SHARE * float(slope @ slope):
-        return 0.0, math.inf
-    step_s = -float(residual @ direction) / power
-    # Correlated errors: the variance of a product's sum, from its own spectrum at zero (Newey and
-    # West), with what the fit leaves as error.
-    errors = (residual + step_s * direction) * direction
-    return step_s, math.sqrt(max(_long_run_variance(errors), 0.0)) / power
-
-
-def _functions(height: Array, velocity: Array) -> Array:
-    """Functions (N, functions) of height, velocity and direction: polynomials and dry friction."""
-    stroke_m = max(float(np.ptp(height)), 1e-12)
-    z = 2.0 * (height - height.mean()) / stroke_m
-    v = velocity / max(float(np.abs(velocity).max()), 1e-12)
-    powers = [item**power for item in (z, v) for power in range(1, _DEGREE + 1)]
-    friction = [_friction(height, share * stroke_m) for share in _FRICTION_OF_STROKE]
-    return np.column_stack([np.ones_like(z), *powers, np.abs(v), np.abs(v) * v, z * v, *friction])
-
-
-def _friction(height_m: Array, reversal_m: float) -> Array:
-    """Dry friction of unit size along heights, shape (N,), after Dahl (1968)."""
-    change = np.diff(height_m)
-    kept = np.exp(-np.abs(change) / reversal_m)
-    gained = np.sign(change) * (1.0 - kept)
-    force = [0.0]
-    for keep, gain in zip(kept.tolist(), gained.tolist(), strict=True):
-        force.append(keep * force[-1] + gain)
-    return np.array(force)
-
-
-def _long_run_variance(values: Array) -> float:
-    """Variance of the sum of a correlated series, lags up to a tenth of it, Bartlett weights."""
-    count = len(values)
-    lags = max(1, count // 10)
-    spectrum = np.fft.rfft(values, 2 * count)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2)[: lags + 1]
-    weights = 1.0 - np.arange(lags + 1) / (lags + 1)
-    return float(correlation[0] + 2.0 * np.sum(weights[1:] * correlation[1:]))
+    nothing = np.zeros((len(slope), 0))
+    force = ForceOverTime(
+        here.height_m, here.velocity_m_per_s, here.force_n, slope[:, np.newaxis], nothing
+    )
+    step = delay_step([force])
+    return float(step.steps_s[0]), float(step.stds_s[0])

@@ -290,7 +290,7 @@ def test_friction_stops_and_loops_take_energy(item):
 
 UNPROPOSED = {
     "none", "preload", "linear_stiffness", "linear_damping", "added_mass", "inerter", "input_gain",
-    "restoring_surface",
+    "delay", "restoring_surface",
 }  # fmt: skip
 
 # Exponents of length, force and time.

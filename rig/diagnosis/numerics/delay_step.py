@@ -30,6 +30,9 @@ stop was taken for a delay of a millisecond."""
 _SLOW = (0.0, 3e-3, 1e-2, 3e-2)
 """Shares of the largest velocity up to which dry friction rises, which has no knot there."""
 
+_ITERATIONS = 8
+"""Steps of Gauss and Newton at most."""
+
 _RANK = 1e-9
 """Eigenvalues below this share of the largest are rounding: of the functions some are alike."""
 
@@ -102,6 +105,34 @@ def delay_step(struts: Sequence[ForceOverTime]) -> DelayStep:
     covariance = inverse @ _long_run_covariance(errors) @ inverse
     stds[known] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return DelayStep(steps, stds)
+
+
+def delay_between(late: Array, course: Array, step_s: float) -> tuple[float, float]:
+    """Delay of a signal against a known course of it in s, and its standard deviation.
+
+    Both are of shape (N,), `step_s` apart; NaN in the signal is left out.
+    """
+    delay_s, std_s = 0.0, np.inf
+    t_s = step_s * np.arange(len(course))
+    known = np.isfinite(late)
+    for _ in range(_ITERATIONS):
+        seen = np.interp(t_s - delay_s, t_s, course)
+        slope = np.gradient(seen, step_s)
+        both = np.column_stack([np.ones_like(slope), slope])[known]
+        power = float(np.sum((both[:, 1] - both[:, 1].mean()) ** 2))
+        if power <= 0.0:
+            return 0.0, np.inf
+        # A cell's zero is no matter of its delay.
+        error = (late - seen)[known]
+        solution = np.linalg.lstsq(both, error, rcond=None)[0]
+        change = float(solution[1])
+        left = error - both @ solution
+        errors = (left * (both[:, 1] - both[:, 1].mean()))[:, np.newaxis]
+        std_s = float(np.sqrt(max(_long_run_covariance(errors)[0, 0], 0.0))) / power
+        delay_s -= change
+        if abs(change) < 0.01 * std_s:
+            break
+    return delay_s, std_s
 
 
 def _own_power(gram: Array, i: int) -> float:

@@ -27,6 +27,8 @@ one of 100 Hz delays by 2.3 ms), or two cycles of a bus at 1 kHz. Where the data
 a tenth of it or ten times as much are found alike."""
 LONGEST_S = 0.1
 """Longest delay, either way, that is searched for."""
+SIGNIFICANT = 4.0
+"""Standard deviations from which on an estimate counts before a search, or without one."""
 UNKNOWN_S = 0.01
 """Longest delay that is considered where the data do not show it: a fit of an unknown one would
 only replace damping."""
@@ -54,11 +56,11 @@ def delay_parameters(spec: ModelSpec, recording: Recording) -> tuple[LinearParam
     for index, strut in enumerate(spec.struts):
         is_seen = recording.inputs or (cells_n is not None and np.isfinite(cells_n[:, index]).all())
         if is_seen and not any(item.name == "delay" for item in strut.effects):
-            delays.append(_parameter(index, -1, f"{column}:{strut.name}"))
+            delays.append(_parameter(recording, index, -1, f"{column}:{strut.name}"))
     inputs = inputs_of(recording, spec) if recording.inputs else {}
     for index, (name, item) in enumerate(inputs.items()):
         if index:
-            delays.append(_parameter(0, index, f"{item.quantity.column}:{name}"))
+            delays.append(_parameter(recording, 0, index, f"{item.quantity.column}:{name}"))
     return tuple(delays)
 
 
@@ -67,8 +69,9 @@ def is_undetermined(parameter: LinearParameter) -> bool:
     return parameter.kind == "delay" and parameter.most - parameter.least >= 2.0 * UNKNOWN_S
 
 
-def _parameter(strut: int, index: int, channel: str) -> LinearParameter:
-    return LinearParameter(strut, "delay", 0.0, STD_S, -UNKNOWN_S, index, channel, UNKNOWN_S)
+def _parameter(recording: Recording, strut: int, index: int, channel: str) -> LinearParameter:
+    known_s = recording.delays_s.get(channel, 0.0)
+    return LinearParameter(strut, "delay", known_s, STD_S, -UNKNOWN_S, index, channel, UNKNOWN_S)
 
 
 def delays_of(

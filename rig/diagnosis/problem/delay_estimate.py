@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.diagnosis.numerics.delay_step import DelayStep, ForceOverTime, delay_step
-from rig.diagnosis.problem.channel_delays import LONGEST_S
+from rig.diagnosis.problem.channel_delays import LONGEST_S, SIGNIFICANT
 from rig.diagnosis.problem.problem import (
     CandidateModel,
     LinearParameter,
@@ -20,8 +20,6 @@ from rig.diagnosis.problem.problem import (
 Array = NDArray[np.float64]
 
 _ITERATIONS = 6
-_SIGNIFICANT = 4.0
-"""Standard deviations from which on an estimate is where the search begins, instead of zero."""
 _WIDTH, _LEAST_WIDTH_S = 5.0, 0.5e-3
 """Standard deviations about an estimate, and least time, within which a delay is searched for: the
 functions of the estimate bend less than a stop, whose contact it takes for 0.1 ms."""
@@ -52,7 +50,7 @@ def with_estimated_delays(problem: Problem) -> Problem:
 
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
     """A delay that is searched for about an estimate, of which the recordings know the error."""
-    expected_s = delay_s if abs(delay_s) > _SIGNIFICANT * std_s else 0.0
+    expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
     width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
     return parameter._replace(
         expected=expected_s, least=expected_s - width_s, most=expected_s + width_s

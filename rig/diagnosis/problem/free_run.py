@@ -20,11 +20,12 @@ from dart_model.effects import Bench
 from dart_model.spec import WORLD, ModelSpec
 from rig.channels.measured_quantities import MOTION
 from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
-from rig.diagnosis.numerics.delay_step import ForceOverTime
+from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_between
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
 from rig.diagnosis.problem.channel_delays import (
+    SIGNIFICANT,
     Delays,
     LateReader,
     delays_of,
@@ -588,8 +589,44 @@ class FreeRunProblem(Problem):
             along = track_of(motion, self._before_delays(k, model))
             forces = track.strut_forces(self, model, along, self.states(k, model))
             at = np.column_stack([np.interp(t_s, run.grid.t_s, force) for force in forces])
+            if model is models.corrected:
+                at = _late_as(cells, at, run.grid.step_s)
             errors.append(rms(cells - at))
         return BeforeAfter(*errors)
+
+    def delays_of_cells(self, model: CandidateModel) -> dict[int, tuple[float, float]]:
+        """Delay in s of each strut's load cell against a model, and its standard deviation."""
+        found: dict[int, list[tuple[float, float]]] = {}
+        for k, run in enumerate(self.runs):
+            motion = self.simulate(self._before_delays(k, model), model, model.parts.starts[k])
+            if run.cells is None or motion is None or any(self.plants.plain.mockups):
+                return {}
+            along = track_of(motion, self._before_delays(k, model))
+            forces = track.strut_forces(self, model, along, self.states(k, model))
+            t_s, cells_n = run.cells
+            for i in np.flatnonzero(np.isfinite(cells_n).any(axis=0)).tolist():
+                course = np.interp(t_s, run.grid.t_s, forces[i])
+                delay = delay_between(cells_n[:, i], course, run.grid.step_s)
+                found.setdefault(i, []).append(delay)
+        return {i: _weighted_mean(delays) for i, delays in found.items()}
+
+
+def _weighted_mean(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of values with their standard deviations, and its own."""
+    weights = np.array([max(std, 1e-12) ** -2 for _, std in values])
+    mean = float(np.average([value for value, _ in values], weights=weights))
+    return mean, float(np.sum(weights)) ** -0.5
+
+
+def _late_as(cells_n: Array, forces_n: Array, step_s: float) -> Array:
+    """Forces (N, struts) as late as load cells show them."""
+    t_s = step_s * np.arange(len(forces_n))
+    late = forces_n.copy()
+    for i in np.flatnonzero(np.isfinite(cells_n).any(axis=0)).tolist():
+        delay_s, std_s = delay_between(cells_n[:, i], forces_n[:, i], step_s)
+        if abs(delay_s) > SIGNIFICANT * std_s:
+            late[:, i] = np.interp(t_s - delay_s, t_s, forces_n[:, i])
+    return late
 
 
 def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:

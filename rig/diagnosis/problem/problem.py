@@ -318,6 +318,14 @@ class Problem(ABC):
             RecordingError: A model runs away.
         """
 
+    def delays_of_cells(self, model: CandidateModel) -> dict[int, tuple[float, float]]:
+        """Delays in s, with their standard deviations, of load cells that take no part in fits.
+
+        By the index of their strut.
+        """
+        del model
+        return {}
+
     @property
     def recordings(self) -> int:
         """Number of recordings."""
