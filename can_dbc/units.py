@@ -25,6 +25,10 @@ class Dimension(Enum):
     TEMPERATURE = "degC"
     MASS = "kg"
     TIME = "s"
+    ANGLE = "rad"
+    ANGULAR_VELOCITY = "rad/s"
+    POWER = "W"
+    ENERGY = "J"
     NUMBER = "1"
 
 
@@ -51,6 +55,8 @@ _SPELLINGS: dict[tuple[Dimension, str], str] = {
     (Dimension.TEMPERATURE, "deg C"): "degC",
     (Dimension.TEMPERATURE, "deg F"): "degF",
     (Dimension.TORQUE, "Nm"): "N*m",
+    (Dimension.ANGLE, "°"): "deg",
+    (Dimension.ANGULAR_VELOCITY, "°/s"): "deg/s",
     (Dimension.TORQUE, "mNm"): "mN*m",
     (Dimension.TORQUE, "kNm"): "kN*m",
     (Dimension.DAMPING, "Ns/m"): "N*s/m",

@@ -1,7 +1,9 @@
 """What a model that runs in step with a bench must be able to do, whatever simulates it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
+
+from dart_model.virtual_sensors import VirtualSensor
 
 
 class ModelState(Protocol):
@@ -50,6 +52,25 @@ class LoadedModel(Protocol[StateT_co]):
 
 
 LoadedT = TypeVar("LoadedT", bound=LoadedModel[ModelState])
+
+
+LoadedT_contra = TypeVar("LoadedT_contra", bound=LoadedModel[ModelState], contravariant=True)
+
+
+class SensorReader(Protocol[LoadedT_contra]):
+    """Virtual sensors of bodies and joints in a model."""
+
+    def read(self, loaded: LoadedT_contra, residual_forces_n: Sequence[float]) -> list[float]:
+        """What they show, in SI, where struts act with their laws and these forces."""
+        ...
+
+    def force_gains(self, loaded: LoadedT_contra) -> list[list[float]]:
+        """Change of each sensor by a newton in each strut, shape (sensors, struts)."""
+        ...
+
+
+AnySensorReader = SensorReader[Any]
+"""A reader of whatever engine."""
 
 
 class Plant(Protocol[StateT, LoadedT]):
@@ -103,6 +124,14 @@ class Plant(Protocol[StateT, LoadedT]):
         """Stiffness (N/m) and damping (N·s/m) of each strut's law about a state.
 
         None where they are the same in every state, or not known.
+        """
+        ...
+
+    def virtual_sensors(self, sensors: Mapping[str, VirtualSensor]) -> SensorReader[LoadedT]:
+        """What reads virtual sensors of bodies and joints.
+
+        Raises:
+            ModelError: The model has not what one reads.
         """
         ...
 

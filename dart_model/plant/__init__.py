@@ -11,12 +11,13 @@
     integrator    Kutta's method, and how long its steps may be
     equations_of_motion  struts on joints
     state         arguments and results
+    virtual_sensors      variables of a model that nothing measures
     prescribed_strut     a strut whose motion is given, as on a dyno
 
 Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,9 @@ from dart_model.plant.prescribed_strut import PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
 from dart_model.plant.strut import struts_of
+from dart_model.plant.virtual_sensors import VirtualSensors
 from dart_model.spec import ModelSpec
+from dart_model.virtual_sensors import VirtualSensor
 
 __all__ = ["LONGEST_STEP_S", "DartPlant", "PlantState", "PrescribedStrut"]
 
@@ -254,6 +257,22 @@ class DartPlant:
             return self._equations.slopes(state, inputs, temperature_c)
         except (ArithmeticError, ValueError):
             return None
+
+    def virtual_sensors(self, sensors: Mapping[str, VirtualSensor]) -> VirtualSensors:
+        """Readers of bodies and joints, by the names of virtual sensors.
+
+        Raises:
+            ModelError: One names no body or joint.
+        """
+
+        def accelerate(loaded: Loaded, virtual_forces_n: Sequence[float]) -> list[float]:
+            if tuple(virtual_forces_n) != loaded.virtual_forces_n:
+                loaded = self.load(
+                    loaded.state, virtual_forces_n, loaded.inputs, loaded.temperature_c
+                )
+            return np.atleast_1d(loaded.acceleration).tolist()
+
+        return VirtualSensors(self.spec, self._skeleton, self._geometry, sensors, accelerate)
 
     def jacobians(self, q: Array) -> Jacobians:
         """Heights and Jacobians of the struts at coordinates `q`, shape (n,)."""

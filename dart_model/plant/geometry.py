@@ -171,6 +171,17 @@ class Geometry:
         lower, upper = here[..., :3, 3] + arms
         return _Ends(arms, jacobians, upper - lower)
 
+    def lines(self, q: Array) -> tuple[Array, Array]:
+        """Directions (struts, 3) along which struts push, and their ends, (2, struts, 3), at `q`.
+
+        In m and in the world's directions, lower ends first.
+        """
+        ends = self._ends_at(q)
+        bodies, _ = self._attached
+        frames = [of.getWorldTransform().matrix()[:3, 3] for of in self._carriers]
+        origins = np.array([*frames, np.zeros(3)])[bodies]
+        return self._directions(ends.gaps_m), origins + ends.arms_m
+
     def reaching(self, heights_m: Array, near: Array) -> Array:
         """Coordinates with given strut heights, by Newton's method; moved ones stay where they are.
 

@@ -86,7 +86,8 @@ class Inputs:
 
     def __init__(self, spec: ModelSpec, dart: DartSkeleton) -> None:
         self._dart = dart
-        self._forces: list[tuple[int, DartBody, Array, Array]] = []
+        self.forces: list[tuple[int, DartBody, Array, Array]] = []
+        """Column, body, point in its frame (m) and direction of each force."""
         self._fixed: list[tuple[int, int, float]] = []
         """Column, coordinate and value of the entries that are the same everywhere."""
         self.first_force: int | None = None
@@ -129,7 +130,7 @@ class Inputs:
         bodies = {body.getName(): body for body in self._dart.getBodyNodes()}
         body = _find(item.force_on, bodies, where)
         axis = np.array(item.axis) / np.linalg.norm(item.axis)
-        self._forces.append((column, body, np.array(item.at), axis))
+        self.forces.append((column, body, np.array(item.at), axis))
         if self.first_force is None:
             self.first_force = column
 
@@ -159,7 +160,7 @@ class Inputs:
         In the row of a moved coordinate it is the acceleration per unit.
         """
         columns = np.zeros((self._dart.getNumDofs(), self.size))
-        for index, body, at, axis in self._forces:
+        for index, body, at, axis in self.forces:
             jacobian = self._dart.getLinearJacobian(body, at)
             columns[self.free, index] = (axis @ jacobian)[self.free]
         for index, coordinate, value in self._fixed:

@@ -21,6 +21,7 @@ from rig.bridge.outgoing_messages import Outgoing
 from rig.bridge.sample_times import SenderClock
 from rig.bridge.supervision_limits import Limits
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
+from rig.bridge.virtual_sensors import SensedState, VirtualSensors
 from rig.channels.channel import Channel, Sample
 from rig.observers.protocol import AnyObserver
 
@@ -65,6 +66,7 @@ class BridgeState(Struct, frozen=True, gc=False):
         clocks: Clock of each incoming message's sender; None before its first frame.
         past: Steps that late samples may belong to.
         operation: State of arming and ramps.
+        sensed: What the virtual sensors remember; None where no model moves.
     """
 
     supervised: SupervisedState
@@ -76,6 +78,7 @@ class BridgeState(Struct, frozen=True, gc=False):
     clocks: tuple[SenderClock | None, ...] = ()
     past: Past = ()
     operation: OperationState = NOT_OPERATED
+    sensed: SensedState | None = None
 
     @property
     def counts(self) -> Counts:
@@ -117,6 +120,7 @@ class Bridge:
         outgoing: Sequence[Outgoing],
         devices: Sequence[Device],
         limits: Limits,
+        sensors: VirtualSensors | None = None,
     ) -> None:
         self.supervisor = supervisor
         """What owns the mode."""
@@ -127,6 +131,7 @@ class Bridge:
         self._immediate = self._operation.switches | supervisor.compared
         self._outgoing = tuple(outgoing)
         self._devices = tuple(devices)
+        self._sensors = sensors
         own = frozenset(item.message.key for item in outgoing)
         struts = supervisor.estimator.struts
         self._checks = FrameChecks(incoming, own, devices, channels, limits.channels)
@@ -163,6 +168,7 @@ class Bridge:
             self._outgoing,
             self._devices,
             limits,
+            self._sensors,
         )
 
     def init(self, t_ns: int) -> BridgeState:
@@ -247,6 +253,9 @@ class Bridge:
             operation = self._operation.update(operation, step_input, supervised.mode)
             reports = self._with_permission(reports, operation, t_ns)
         supervised, output, action = self.supervisor.step(supervised, step_input, reports)
+        sensed = None
+        if self._sensors is not None:
+            sensed, output = self._read_sensors(state.sensed, supervised, output, t_ns)
         if is_operated:
             safe_n = self.supervisor.safe_forces_n(supervised)
             operation, output = self._operation.publish(operation, t_ns, output, safe_n)
@@ -265,8 +274,25 @@ class Bridge:
             tuple(reception.clocks),
             () if supervised.mode in _NO_MODEL else past,
             operation,
+            sensed,
         )
         return after, TickResult(sent_frames, step_input, output, counts, wrong)
+
+    def _read_sensors(
+        self,
+        sensed: SensedState | None,
+        supervised: SupervisedState,
+        output: StepOutput,
+        t_ns: int,
+    ) -> tuple[SensedState | None, StepOutput]:
+        """What the virtual sensors remember, and the output with what they show."""
+        if self._sensors is None or supervised.mode in _NO_MODEL or not output.struts:
+            return None, output
+        loaded = self.supervisor.estimator.model_of(supervised.estimator)
+        if loaded is None and self._sensors.reads_model:
+            return None, output
+        sensed, shown = self._sensors.read(sensed, t_ns, loaded, output.struts)
+        return sensed, replace(output, sensors=shown)
 
     def _reports(
         self,

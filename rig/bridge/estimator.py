@@ -7,11 +7,13 @@ An estimator knows no modes: when its estimate is published, and as what, is dec
 `rig.bridge.mode_supervisor`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
 
+from dart_model.protocol import AnySensorReader
+from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.values import StepInput, StrutOutput
 from rig.observers.protocol import AnyObserver
 
@@ -78,6 +80,18 @@ class Estimator(Protocol[StateT]):
 
     def heights_m(self, state: StateT) -> Sequence[float]:
         """Height at which each strut stands if the model stops here; empty while it waits."""
+        ...
+
+    def read_model(self, sensors: Mapping[str, VirtualSensor]) -> AnySensorReader:
+        """What reads virtual sensors of bodies and joints in `model_of` a state.
+
+        Raises:
+            InputError: The model has not what one reads.
+        """
+        ...
+
+    def model_of(self, state: StateT) -> object | None:
+        """The model under its forces, for virtual sensors; None where none moves."""
         ...
 
     def with_settings(

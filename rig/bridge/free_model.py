@@ -2,14 +2,15 @@
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
-from dart_model.protocol import AnyPlant, LoadedModel, ModelState
+from dart_model.protocol import AnyPlant, AnySensorReader, LoadedModel, ModelState
+from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
@@ -185,6 +186,12 @@ class FreeModelEstimator:
         if state.model is None:
             return ()
         return [height_m for height_m, _ in state.model.state.struts]
+
+    def read_model(self, sensors: Mapping[str, VirtualSensor]) -> AnySensorReader:
+        return self._plant.virtual_sensors(sensors)
+
+    def model_of(self, state: FreeModelState) -> LoadedModel[ModelState] | None:
+        return state.model
 
     def step(
         self, state: FreeModelState, step_input: StepInput

@@ -7,7 +7,7 @@ No model contradicts height and load cell. What does is what is usual of them: t
 samples, and the band of the filter's innovations.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -15,6 +15,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
+from dart_model.errors import ModelError
+from dart_model.protocol import AnySensorReader
+from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
@@ -155,6 +158,13 @@ class PrescribedMotionEstimator:
     def heights_m(self, state: PrescribedMotionState) -> Sequence[float]:
         """Last measured height as it is filtered; empty before the first one."""
         return () if state.motion is None else (state.motion.position_m,)
+
+    def read_model(self, sensors: Mapping[str, VirtualSensor]) -> AnySensorReader:
+        """None can be read: a plan has refused them."""
+        raise ModelError(f"virtual sensors {', '.join(sensors)}: no body moves on a dyno")
+
+    def model_of(self, state: PrescribedMotionState) -> None:
+        del state
 
     def step(
         self, state: PrescribedMotionState, step_input: StepInput

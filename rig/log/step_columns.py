@@ -59,11 +59,17 @@ class Step(Struct, frozen=True, gc=False):
 class LogColumns:
     """Columns of a run's log, and the numbers of a tick in their order.
 
-    First stand inputs and quantities of the bench, then the struts, then the further sensors.
+    First stand inputs and quantities of the bench, then the struts, then the further sensors, then
+    value and standard deviation of the virtual ones (`virtual`).
     The indices of the channels are their positions.
     """
 
-    def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:
+    def __init__(
+        self,
+        struts: Sequence[str],
+        channels: Sequence[Channel],
+        virtual: Sequence[tuple[str, str]] = (),
+    ) -> None:
         bench = [channel for channel in channels if channel.role in (Role.BENCH, Role.INPUT)]
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
         first = [len(bench) + i * len(STRUT_COLUMNS) for i in range(len(struts))]
@@ -80,12 +86,15 @@ class LogColumns:
                 self._column_of[channel.index] = first[channel.strut]
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._blank = [nan] * begin_of_sensors + [nan, 0.0] * len(sensors)
+        self._virtual = len(self._blank)
+        self._blank += [nan] * (2 * len(virtual))
         for begin in published:  # invalid is what is sent before an estimate
             self._blank[begin + _PUBLISHED.index("valid")] = 0.0
         self.names: tuple[str, ...] = (
             *(channel.column for channel in bench),
             *(f"{strut}.{name}" for strut in struts for name in STRUT_COLUMNS),
             *(name for channel in sensors for name in (channel.column, f"{channel.name}.left_out")),
+            *(name for names in virtual for name in names),
         )
         """Names of the columns."""
 
@@ -100,6 +109,9 @@ class LogColumns:
         if output.struts:
             for columns, strut in zip(self._published, output.struts, strict=True):
                 numbers[columns] = astuple(strut)
+        for index, shown in enumerate(output.sensors):
+            column = self._virtual + 2 * index
+            numbers[column : column + 2] = shown.value, shown.std
         for channel in output.left_out:
             numbers[column_of[channel] + 1] = 1.0
         return numbers

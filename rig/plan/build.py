@@ -16,6 +16,7 @@ from rig.bridge.measured_inputs import AnyInput, HeldInput, MovedInput
 from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
+from rig.bridge.virtual_sensors import VirtualSensors
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
@@ -34,10 +35,10 @@ def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
         InputError: The model cannot be built.
         DatabaseError: A signal does not fit its quantity.
     """
-    outgoing = plan.outgoing if sending else ()
+    outgoing, estimator = plan.outgoing if sending else (), _build_estimator(plan)
     return Bridge(
         Supervisor(
-            _build_estimator(plan),
+            estimator,
             plan.config.supervision,
             plan.limits.struts,
             plan.bench_channel(LOAD_CELL_FORCE),
@@ -47,7 +48,17 @@ def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
         [compile_outgoing(item.message, item.signals) for item in outgoing],
         plan.devices,
         plan.limits,
+        _virtual_sensors(plan, estimator),
     )
+
+
+def _virtual_sensors(plan: Plan, estimator: AnyEstimator) -> VirtualSensors | None:
+    sensors = plan.virtual_sensors
+    if not sensors:
+        return None
+    of_model = {item.name: item.sensor for item in sensors if item.strut is None}
+    reader = estimator.read_model(of_model) if of_model else None
+    return VirtualSensors([item.strut for item in sensors], reader)
 
 
 def build_plant(plan: Plan) -> AnyPlant:

@@ -21,6 +21,7 @@ from can_dbc.errors import expected_name
 from can_dbc.units import Dimension
 from can_dbc.yaml_file import Finite, Positive
 from dart_model.spec import InputName
+from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.devices import DeviceSettings
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING, Publication
@@ -293,6 +294,27 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
     return read
 
 
+def _with_published_sensors(data: object) -> object:
+    """A configuration whose virtual sensors have the signals that `publish` gives them."""
+    given = cast("dict[object, Any]", data) if isinstance(data, dict) else {}
+    sensors, published = given.get("virtual_sensors"), given.get("publish")
+    if not (isinstance(sensors, dict) and isinstance(published, dict)):
+        return cast("object", data)
+    sensors, published = cast("_Group", sensors), cast("_Group", published)
+    entries = {
+        name: {**cast("_Group", item), "publish": published[name]}
+        if name in published and isinstance(item, dict)
+        else item
+        for name, item in sensors.items()
+    }
+    rest = {key: value for key, value in given.items() if key != "publish"}
+    others = {name: item for name, item in published.items() if name not in sensors}
+    return {**rest, "virtual_sensors": entries, **({"publish": others} if others else {})}
+
+
+_Group = dict[object, object]
+
+
 class Unsafe(_Frozen):
     """What is refused unless the user accepts the risk.
 
@@ -339,6 +361,16 @@ class LogConfig(_Frozen):
         return CaptureWindow(before_ns, after_ns, self.most_captures)
 
 
+class VirtualSensorConfig(VirtualSensor):
+    """A variable of the model that is logged, plotted and published as a sensor's reading is.
+
+    Attributes:
+        publish: Signal that carries it; the same as an entry of its name under `publish`.
+    """
+
+    publish: SignalName | None = None
+
+
 class RunConfig(_Frozen):
     """All of a run's configuration.
 
@@ -365,6 +397,8 @@ class RunConfig(_Frozen):
             it.
         timing: Signals that show how well the rate is kept, by the keys of the published
             quantities, or the name of a message. Nothing by default.
+        virtual_sensors: Variables of the model that are logged, plotted and, with an entry of their
+            name under `publish`, sent.
         supervision: Conditions of a valid estimate, limits and safe state.
         unsafe: Permissions that may cause damage on a bench.
         realtime: Real-time conditions that are requested from the operating system.
@@ -387,6 +421,9 @@ class RunConfig(_Frozen):
     publish: dict[StrutKey, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
     status: Annotated[Mapped, BeforeValidator(_mapping(STATUS))] | None = None
     timing: Annotated[Mapped, BeforeValidator(_mapping(TIMING))] | None = None
+    virtual_sensors: dict[Annotated[SensorName, KeyName("NAME")], VirtualSensorConfig] = Field(
+        default_factory=dict[str, VirtualSensorConfig]
+    )
     supervision: Supervision = Supervision()
     unsafe: Unsafe = Unsafe()
     realtime: Realtime = Realtime()
@@ -395,7 +432,11 @@ class RunConfig(_Frozen):
     @model_validator(mode="before")
     @classmethod
     def _one_strut(cls, data: Any) -> object:
-        """Let a model of one strut be measured and published without the strut's name."""
+        """Let a model of one strut be measured and published without the strut's name.
+
+        What is published of a virtual sensor becomes a part of that.
+        """
+        data = cast("Any", _with_published_sensors(data))
         match data:
             case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:
                 data = {**rest, "signals": {**others, "height": {"": height}}}

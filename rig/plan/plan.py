@@ -53,6 +53,7 @@ from rig.plan.config import (
     Signals,
 )
 from rig.plan.limits import resolve_limits
+from rig.plan.virtual_sensors import PlannedSensor, publication_of, resolve_sensors
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
 """Between the sensors of one strut: a filter that goes back by more at every reading takes half a
@@ -112,6 +113,7 @@ class Plan:
     Attributes:
         config: The configuration, with every strut and every published signal named.
         inputs: Inputs of the model, in its order.
+        virtual_sensors: Variables of the model that are read as sensors are.
         channels: Channels of the bench: heights, inputs, quantities of the bench, further sensors.
         alarms: Messages with alarms of the devices, and the alarms.
         limits: Limits: the configured ones, and those that follow from the DBC.
@@ -126,6 +128,7 @@ class Plan:
     struts: tuple[PlannedStrut, ...]
     inputs: tuple[PlannedInput, ...]
     channels: tuple[Channel, ...]
+    virtual_sensors: tuple[PlannedSensor, ...]
     outgoing: tuple[PlannedMessage, ...]
     devices: tuple[Device, ...]
     alarms: tuple[tuple[Message, Alarm], ...]
@@ -229,7 +232,14 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
     calibrated = _calibrate(config.signals, _quantities(model), database, source)
     reader = _SignalReader(config, model, calibrated, source)
     channels = reader.channels()
-    outgoing = reader.outgoing()
+    sensors = resolve_sensors(
+        config.virtual_sensors,
+        model,
+        [*config.observers, *model.drive],
+        source,
+        is_prescribed=config.prescribed_motion is not None,
+    )
+    outgoing = reader.outgoing(sensors)
     alarms = reader.alarms()
     for key, message in reader.read.items():
         if message.name in {item.message.name for item in outgoing}:
@@ -245,6 +255,7 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         _struts(config, model, channels),
         _inputs(config, model, applied, channels),
         channels,
+        sensors,
         outgoing,
         _devices(config, channels),
         alarms,
@@ -526,7 +537,7 @@ class _SignalReader:
                 add(Role.SENSOR, entry.quantity, name, key, struts.index(strut), entry)
         return tuple(channels)
 
-    def outgoing(self) -> tuple[PlannedMessage, ...]:
+    def outgoing(self, sensors: Sequence[PlannedSensor]) -> tuple[PlannedMessage, ...]:
         """Messages that the bridge sends, in the order in which they are named."""
         config = self._config
         published: dict[str, list[PublishedSignal]] = {}
@@ -548,6 +559,10 @@ class _SignalReader:
         for strut, name in enumerate(config.observers):
             for key, entry in (config.publish or {}).get(name, {}).items():
                 add(f"publish.{name}.{key}", entry, choices[key], strut)
+        for index, sensor in enumerate(sensors):
+            entry = config.virtual_sensors[sensor.name].publish
+            if entry is not None:
+                add(f"publish.{sensor.name}", entry, publication_of(sensor), index)
         for group, entries, publications in (
             ("status", config.status, STATUS),
             ("timing", config.timing, TIMING),

@@ -85,7 +85,9 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         refuse_damage(folder, run_folder.damage)
         raise
     ticks = _ticks(run_folder, frames, plan.period_ns)
-    columns = LogColumns(plan.strut_names, plan.channels)
+    columns = LogColumns(
+        plan.strut_names, plan.channels, [it.columns for it in plan.virtual_sensors]
+    )
     rows = StepRows(columns.names)
     batches: list[pa.RecordBatch] = []
 
