@@ -87,6 +87,11 @@ class Plant(Protocol[StateT, LoadedT]):
         ...
 
     @property
+    def internal_states(self) -> int:
+        """Number of internal states of all effects, the last of a state's `numbers`."""
+        ...
+
+    @property
     def is_constant(self) -> bool:
         """Whether mass matrix and Jacobians of the struts are the same in every state."""
         ...

@@ -21,12 +21,15 @@ class SensedQuantity(NamedTuple):
         dimension: What it measures, in SI.
         suffix: End of its column in the log: the quantity and its unit.
         meaning: For the guide.
+        by_force: Whether the forces of the struts change it at once, so that it is known as well as
+            they are.
     """
 
     of: str
     dimension: Dimension
     suffix: str
     meaning: str
+    by_force: bool = False
 
 
 KINDS = MappingProxyType({
@@ -41,6 +44,7 @@ KINDS = MappingProxyType({
         Dimension.ACCELERATION,
         "acceleration_m_per_s2",
         "acceleration of such a point; an accelerometer there shows gravity in addition",
+        by_force=True,
     ),
     "angle_of": SensedQuantity(
         "body", Dimension.ANGLE, "angle_rad", "angle by which a body is turned about an axis"
@@ -65,18 +69,28 @@ KINDS = MappingProxyType({
         Dimension.FORCE,
         "reaction_n",
         "force along an axis that a joint exerts on its child body",
+        by_force=True,
     ),
     "torque_of": SensedQuantity(
         "joint",
         Dimension.TORQUE,
         "torque_n_m",
         "torque about an axis through the joint that it exerts on its child body",
+        by_force=True,
     ),
     "force_of": SensedQuantity(
-        "strut", Dimension.FORCE, "force_n", "force of a strut, as it is published of it"
+        "strut",
+        Dimension.FORCE,
+        "force_n",
+        "force of a strut, as it is published of it",
+        by_force=True,
     ),
     "power_of": SensedQuantity(
-        "strut", Dimension.POWER, "power_w", "power that a strut takes from its bodies"
+        "strut",
+        Dimension.POWER,
+        "power_w",
+        "power that a strut takes from its bodies",
+        by_force=True,
     ),
     "energy_of": SensedQuantity(
         "strut",
@@ -92,6 +106,11 @@ _TURNING = {
     "speed_of": SensedQuantity("joint", Dimension.ANGULAR_VELOCITY, "speed_rad_per_s", ""),
 }
 """The same of a joint that turns."""
+
+QUANTITIES = MappingProxyType({it.suffix: it for it in (*KINDS.values(), *_TURNING.values())})
+"""What the columns of virtual sensors hold, by the ends of their names."""
+
+_UPWARDS = (0.0, 0.0, 1.0)
 
 Target = Annotated[str, Field(min_length=1, max_length=64)]
 
@@ -131,7 +150,7 @@ class VirtualSensor(BaseModel):
     power_of: Target | None = None
     energy_of: Target | None = None
     at: Vector = (0.0, 0.0, 0.0)
-    axis: Axis = (0.0, 0.0, 1.0)
+    axis: Axis = _UPWARDS
 
     @model_validator(mode="after")
     def _has_one_kind(self) -> "VirtualSensor":
@@ -140,9 +159,9 @@ class VirtualSensor(BaseModel):
             found = f"{' and '.join(given)} are given" if given else "none is given"
             raise ValueError(f"{found}, expected one of {', '.join(KINDS)}")
         allowed = {"position_of", "velocity_of", "acceleration_of"}
-        if given[0] not in allowed and "at" in self.model_fields_set:
+        if given[0] not in allowed and any(self.at):
             raise ValueError(f"at: expected with {', '.join(sorted(allowed))} alone")
-        if KINDS[given[0]].of == "strut" and "axis" in self.model_fields_set:
+        if KINDS[given[0]].of == "strut" and self.axis != _UPWARDS:
             raise ValueError(f"axis: expected none with {given[0]}")
         return self
 

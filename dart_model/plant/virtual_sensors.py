@@ -90,24 +90,24 @@ class VirtualSensors:
         forces = [law + more for law, more in zip(loaded.forces_n, residual_forces_n, strict=True)]
         state = loaded.state
         if self._affine is not None:
-            matrix, offset, by_virtual = self._affine
+            matrix = self._affine
             change = [
                 a - b for a, b in zip(residual_forces_n, loaded.virtual_forces_n, strict=True)
             ]
-            acceleration = np.atleast_1d(loaded.acceleration)
-            numbers = np.array(
-                [
-                    *state.positions,
-                    *state.velocities,
-                    *acceleration.tolist(),
-                    *forces,
-                    *loaded.inputs,
-                ]
-            )
-            values: Array = matrix @ numbers + offset
-            if any(change):
-                values = values + by_virtual @ np.array(change)
-            return values.tolist()
+            # A float where there is one coordinate.
+            a = loaded.acceleration
+            accelerations: Sequence[float] = (a,) if isinstance(a, float) else a.tolist()
+            numbers = [
+                *state.positions,
+                *state.velocities,
+                *accelerations,
+                *forces,
+                *loaded.inputs,
+                *change,
+                1.0,
+            ]
+            values: list[float] = matrix.dot(numbers).tolist()
+            return values
         acceleration = self._accelerate(loaded, residual_forces_n)
         motion = state.positions, state.velocities, acceleration
         q, v, a = (np.array(part) for part in motion)
@@ -137,8 +137,11 @@ class VirtualSensors:
         now = _Instant(forces_n, inputs, directions, ends)
         return [reader(now) for reader in self._readers]
 
-    def _find_affine(self) -> tuple[Array, Array, Array] | None:
-        """Matrix of all numbers, offset, and derivative by virtual forces; None if it is curved."""
+    def _find_affine(self) -> Array | None:
+        """Matrix of all numbers, of more force in parallel with the struts, and of one.
+
+        None where a sensor is curved.
+        """
         if self._geometry.constant is None:
             return None
         n, struts = self._skeleton.coordinates, len(self._spec.struts)
@@ -159,7 +162,8 @@ class VirtualSensors:
             if not np.allclose(at(numbers), expected, rtol=_AFFINE, atol=_AFFINE):
                 return None
         accelerations = slice(2 * n, 3 * n)
-        return matrix, offset, matrix[:, accelerations] @ self._response()
+        by_more_force = matrix[:, accelerations] @ self._response()
+        return np.ascontiguousarray(np.column_stack([matrix, by_more_force, offset]))
 
     def _response(self) -> Array:
         """Acceleration of the coordinates per newton in parallel with each strut, (n, struts)."""

@@ -1,5 +1,6 @@
 """What a step is given and what it publishes."""
 
+from collections.abc import Sequence
 from enum import Enum, IntEnum
 from math import nan
 
@@ -78,18 +79,12 @@ class StrutOutput(Struct, frozen=True, gc=False):
     law_force_n: float = nan
 
 
-class SensorOutput(Struct, frozen=True, gc=False):
-    """What a virtual sensor shows, in SI, and its standard deviation; NaN where it is not known."""
-
-    value: float
-    std: float
-
-
 class StepOutput(Struct, frozen=True, gc=False):
     """What a tick publishes: of each strut in the model's order, nothing before measurements.
 
     Attributes:
-        sensors: Of each virtual sensor; empty where no model moves.
+        sensors: Of each virtual sensor its value, followed by its standard deviation where it has
+            one; empty where no model moves.
         left_out: Channels of further sensors that are not used now.
         first_cause: Number of the cause of the first HOLD or SAFE since the estimate was last
             valid; 0 if there was none since then.
@@ -99,7 +94,7 @@ class StepOutput(Struct, frozen=True, gc=False):
     struts: tuple[StrutOutput, ...]
     left_out: tuple[int, ...] = ()
     first_cause: int = 0
-    sensors: tuple[SensorOutput, ...] = ()
+    sensors: Sequence[float] = ()
 
 
 class Divergence(Struct, frozen=True, gc=False):

@@ -4,34 +4,49 @@ Bodies and joints move as the model does, under the estimated forces of the stru
 observer states how well it knows a force, so is known what depends on it.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from dart_model.protocol import AnySensorReader
-from rig.bridge.values import SensorOutput, StrutOutput
+from rig.bridge.values import StrutOutput
+
+Array = NDArray[np.float64]
+
+_OF_STRUT = {"force_of": (0, 1), "power_of": (2, 3), "energy_of": (4, None)}
+"""Places of value and standard deviation among the numbers of a strut."""
+_STRUT_NUMBERS = 5
 
 
-class StrutSensor(NamedTuple):
-    """A virtual sensor of a strut: ``force_of``, ``power_of`` or ``energy_of``."""
+class SensorPlace(NamedTuple):
+    """What a virtual sensor reads.
+
+    Attributes:
+        kind: Its key, as of `dart_model.virtual_sensors`.
+        strut: Index of the strut that it is of; -1 for a body or joint.
+        has_std: Whether its standard deviation is shown, too.
+    """
 
     kind: str
     strut: int
+    has_std: bool
 
 
 class SensedState(Struct, frozen=True, gc=False):
     """What is remembered between two ticks.
 
     Attributes:
-        gains: Change of each sensor of the model by a newton in each strut, where it started.
+        squared_gains: Square of the change of each sensor of the model by a newton in each strut,
+            where it started, shape (sensors, struts).
         powers_w: Power that each strut took.
         energies_j: Energy that each strut has taken since the model started.
     """
 
     t_ns: int
-    gains: Sequence[Sequence[float]]
+    squared_gains: Array
     powers_w: tuple[float, ...]
     energies_j: tuple[float, ...]
 
@@ -40,14 +55,26 @@ class VirtualSensors:
     """All virtual sensors of a run, in the order of its configuration.
 
     Args:
-        sensors: A sensor of a strut, or None for one that `reader` reads.
+        sensors: What each reads.
         reader: Reads those of bodies and joints in their order; None where there are none.
     """
 
-    def __init__(
-        self, sensors: Sequence[StrutSensor | None], reader: AnySensorReader | None
-    ) -> None:
-        self._sensors, self._reader = tuple(sensors), reader
+    def __init__(self, sensors: Sequence[SensorPlace], reader: AnySensorReader | None) -> None:
+        self._reader = reader
+        of_model = sum(sensor.strut < 0 for sensor in sensors)
+        self._shows_std = any(sensor.strut < 0 and sensor.has_std for sensor in sensors)
+        self._order: list[int] = []
+        next_of_model = 0
+        for sensor in sensors:
+            if sensor.strut < 0:
+                value, std = next_of_model, of_model + next_of_model
+                next_of_model += 1
+            else:
+                begin = 2 * of_model + _STRUT_NUMBERS * sensor.strut
+                at, at_std = _OF_STRUT[sensor.kind]
+                value, std = begin + at, begin + (at_std or 0)
+            self._order += [value, std] if sensor.has_std else [value]
+        self._no_stds = [np.nan] * of_model
 
     @property
     def reads_model(self) -> bool:
@@ -60,36 +87,37 @@ class VirtualSensors:
         t_ns: int,
         loaded: Any,
         struts: Sequence[StrutOutput],
-    ) -> tuple[SensedState, tuple[SensorOutput, ...]]:
+    ) -> tuple[SensedState, list[float]]:
         """State and readings at a tick whose model is `loaded` and whose struts act as estimated.
 
-        `loaded` is None where no model moves; then there are sensors of struts alone.
+        The readings are the value of each sensor in SI, followed by its standard deviation where it
+        has one. `loaded` is None where no model moves; then there are sensors of struts alone.
         """
         state = self._advance(state, t_ns, loaded, struts)
-        values: Sequence[float] = ()
+        known: list[float] = []
         if self._reader is not None:
             residual_n = [strut.force_n - strut.law_force_n for strut in struts]
-            values = self._reader.read(loaded, residual_n)
-        rest, readings = iter(zip(values, state.gains, strict=True)), list[SensorOutput]()
-        for sensor in self._sensors:
-            if sensor is not None:
-                readings.append(_of_strut(sensor, struts[sensor.strut], state))
-                continue
-            value, gains = next(rest)
-            square = 0.0
-            for gain, strut in zip(gains, struts, strict=True):
-                square += (gain * strut.force_std_n) ** 2
-            # Of what no force changes at once, such as a position, nothing is known by a force.
-            readings.append(SensorOutput(value, math.sqrt(square) if square else math.nan))
-        return state, tuple(readings)
+            known = self._reader.read(loaded, residual_n)
+            stds = self._no_stds
+            # Not NaN: the observers know it.
+            if self._shows_std and struts[0].force_std_n == struts[0].force_std_n:
+                variances = np.array([strut.force_std_n * strut.force_std_n for strut in struts])
+                stds = np.sqrt(state.squared_gains @ variances).tolist()
+            known = known + stds
+        motions = zip(struts, state.powers_w, state.energies_j, strict=True)
+        for strut, power_w, energy_j in motions:
+            std_n = strut.force_std_n
+            std_w = abs(strut.velocity_m_per_s) * std_n
+            known += (strut.force_n, std_n, power_w, std_w, energy_j)
+        return state, [known[index] for index in self._order]
 
     def _advance(
         self, state: SensedState | None, t_ns: int, loaded: Any, struts: Sequence[StrutOutput]
     ) -> SensedState:
         powers_w = tuple([-strut.force_n * strut.velocity_m_per_s for strut in struts])
         if state is None:
-            gains = () if self._reader is None else self._reader.force_gains(loaded)
-            return SensedState(t_ns, gains, powers_w, (0.0,) * len(struts))
+            gains = [] if self._reader is None else self._reader.force_gains(loaded)
+            return SensedState(t_ns, np.square(gains), powers_w, (0.0,) * len(struts))
         half_s = 0.5e-9 * (t_ns - state.t_ns)
         energies_j = tuple(
             [
@@ -99,15 +127,4 @@ class VirtualSensors:
                 )
             ]
         )
-        return SensedState(t_ns, state.gains, powers_w, energies_j)
-
-
-def _of_strut(sensor: StrutSensor, strut: StrutOutput, state: SensedState) -> SensorOutput:
-    match sensor.kind:
-        case "force_of":
-            return SensorOutput(strut.force_n, strut.force_std_n)
-        case "power_of":
-            std_w = abs(strut.velocity_m_per_s) * strut.force_std_n
-            return SensorOutput(state.powers_w[sensor.strut], std_w)
-        case _:
-            return SensorOutput(state.energies_j[sensor.strut], math.nan)
+        return SensedState(t_ns, state.squared_gains, powers_w, energies_j)

@@ -1,16 +1,47 @@
 """`rig replay`."""
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
 import typer
 
 from rig.cli.progress import progress_line
 from rig.cli.summary_file import SummaryFolder, write_summary
-from rig.cli.terminal import FAILED, JsonFlag, RunFolder, console, print_json, print_table
+from rig.cli.terminal import (
+    FAILED,
+    JsonFlag,
+    RunFolder,
+    console,
+    print_json,
+    print_table,
+    print_text,
+)
 
-EXAMPLES = "Example: `rig replay rig-demo/run`"
+if TYPE_CHECKING:
+    from rig.plan.config import VirtualSensorConfig
+    from rig.run.replay import Replay
+
+EXAMPLES = (
+    "Examples: `rig replay rig-demo/run`; `rig replay rig-demo/run --add 'seat: {acceleration_of: "
+    "body}'`"
+)
+
+_Added = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--add",
+        metavar="SENSOR",
+        help="Virtual sensor that is computed and kept beside the log, where exports and "
+        "`rig.open_run` find it: a name and what it reads, as under virtual_sensors of a "
+        "configuration, or a YAML file with that section. Once for each.",
+    ),
+]
 
 
 def replay_command(
     folder: RunFolder,
+    add: _Added = None,
     out: SummaryFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -19,8 +50,11 @@ def replay_command(
     from rig.log.reader import find_changed_files
     from rig.run.replay import replay
 
+    sensors = _read_sensors(add or [])
     with progress_line(None) as progress:
-        result = replay(folder, progress=progress)
+        result = replay(folder, sensors=sensors, progress=progress)
+    if sensors:
+        _keep_sensors(folder, result, sensors)
     summary: dict[str, object] = {
         "ticks": result.steps.num_rows,
         "logged_ticks": result.logged,
@@ -47,6 +81,62 @@ def replay_command(
             console.print(f"{name} is not the one that ran: its hash differs.", style="yellow")
         if result.different:
             console.print("The replay differs from the log.", style="red")
+        if sensors:
+            _print_sensors(folder, result.steps.schema.names, sensors)
     refuse_damage(folder, result.damage)
     if result.different or changed or result.steps.num_rows == 0:
         raise typer.Exit(FAILED)
+
+
+def _read_sensors(texts: Sequence[str]) -> "dict[str, VirtualSensorConfig]":
+    """Virtual sensors by name, from texts or files."""
+    from can_dbc.errors import InputError
+    from can_dbc.yaml_file import parse_mapping, read_text, validate
+    from rig.plan.config import VirtualSensorConfig
+
+    sensors: dict[str, VirtualSensorConfig] = {}
+    for text in texts:
+        source = "--add"
+        if Path(text).is_file() or ":" not in text:
+            source = f"--add {text}"
+            section = parse_mapping(read_text(Path(text)), text).get("virtual_sensors")
+            if not isinstance(section, dict):
+                raise InputError(f"{source}: expected a section virtual_sensors")
+            given = cast("dict[str, object]", section)
+        else:
+            given = parse_mapping(text, source)
+        for name, item in given.items():
+            sensors[name] = validate(VirtualSensorConfig, item, f"{source}: {name}")
+    return sensors
+
+
+def _columns_of(names: Sequence[str], sensors: Mapping[str, object]) -> list[str]:
+    """Columns of some virtual sensors among those of recomputed steps."""
+    return [name for name in names if name.partition(".")[0] in sensors]
+
+
+def _keep_sensors(folder: Path, result: "Replay", sensors: Mapping[str, object]) -> None:
+    from can_dbc.errors import InputError
+    from rig.log.added_columns import write_added
+
+    names = _columns_of(result.steps.schema.names, sensors)
+    try:
+        write_added(folder, result.steps, names, result.logged)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def _print_sensors(folder: Path, names: Sequence[str], sensors: Mapping[str, object]) -> None:
+    import numpy as np
+
+    from rig.formats.run_arrays import open_run
+    from rig.log.file_names import ADDED_FILE
+
+    run, rows = open_run(folder), list[tuple[str, ...]]()
+    for name in _columns_of(names, sensors):
+        values = run.columns[name][np.isfinite(run.columns[name])]
+        if len(values) and "_std_" not in name:
+            figures = values.mean(), values.std(), values.min(), values.max()
+            rows.append((name, *(f"{it:.4g}" for it in figures)))
+    print_table(("virtual sensor", "mean", "RMS about it", "smallest", "largest"), rows)
+    print_text(f"Kept in {folder / ADDED_FILE}; the log is as it was.")

@@ -19,6 +19,7 @@ from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
 from dart_model.spec import ModelSpec
+from dart_model.virtual_sensors import KINDS
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.bridge.values import Mode
 from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
@@ -83,6 +84,7 @@ def generated_blocks(
         "bench-effects": _bench_effects,
         "measured-quantities": _measured_quantities,
         "published-quantities": _published_quantities,
+        "virtual-sensors": _virtual_sensors,
         "effect-families": _families,
         "modes": lambda: _table(
             ("Mode", "Number on the bus"), [(mode.name, str(mode.value)) for mode in Mode]
@@ -144,6 +146,13 @@ def _published_quantities() -> str:
         for item in items
     ]
     return _table(("Under", "Key", "Unit", "Default signal", "Meaning"), rows)
+
+
+def _virtual_sensors() -> str:
+    rows = [
+        (f"`{key}`", f"a {it.of}", _unit(it.dimension), it.meaning) for key, it in KINDS.items()
+    ]
+    return _table(("Key", "Value", "Unit", "Reading"), rows)
 
 
 _UNITS = {Dimension.NUMBER: "-", Dimension.TEMPERATURE: "°C", Dimension.ACCELERATION: "m/s²"}

@@ -44,6 +44,7 @@ _NAVIGATION: dict[str, tuple[str, ...]] = {
         "how-to/several-struts",
         "how-to/inputs",
         "how-to/several-sensors",
+        "how-to/virtual-sensors",
         "how-to/tune",
         "how-to/supervise",
         "how-to/watch",

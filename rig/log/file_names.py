@@ -9,6 +9,7 @@
     events.jsonl    changes of the mode, with their causes, and what the machine did to the run
     timing.json     histograms of its ticks
     trace.arrow     parts of its late ticks, if they were traced
+    added.arrow     virtual sensors that were computed after it
     checksums.txt   lengths and checksums of the finished files of frames and steps
     captures/       windows around its faults, each a run folder
 
@@ -21,6 +22,7 @@ from pathlib import Path
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 CHANGES_FILE, HISTOGRAMS_FILE, TRACE_FILE = "changes.jsonl", "timing.json", "trace.arrow"
+ADDED_FILE = "added.arrow"
 CAPTURES_FOLDER, EVENTS_FILE, CHECKSUMS_FILE = "captures", "events.jsonl", "checksums.txt"
 
 

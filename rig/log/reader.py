@@ -15,6 +15,7 @@ import pyarrow as pa
 from can_dbc.frame import Frame
 from can_dbc.yaml_file import parse_mapping, read_text
 from rig.files.hashes import hash_files
+from rig.log.added_columns import read_added
 from rig.log.candump import LATEST_S, line_error, parse_frame
 from rig.log.checksums import Damage, find_damage
 from rig.log.errors import LogError
@@ -101,7 +102,7 @@ class RunFolder:
     """A run that is read back.
 
     Of its steps what a kill cut off is missing, and every file whose checksum differs: a changed
-    bit may be a height of any size.
+    bit may be a height of any size. Behind their columns come those that were added later.
     """
 
     folder: Path
@@ -109,6 +110,12 @@ class RunFolder:
     steps: pa.Table
     epoch_ns: int
     damage: tuple[Damage, ...] = ()
+    added: tuple[str, ...] = ()
+
+    @property
+    def logged_steps(self) -> pa.Table:
+        """The steps as the run logged them."""
+        return self.steps.drop_columns(list(self.added)) if self.added else self.steps
 
     @property
     def frame_files(self) -> list[Path]:
@@ -154,7 +161,11 @@ def read_run(folder: Path) -> RunFolder:
     damage = find_damage(folder)
     altered = [item.name for item in damage if not item.is_readable]
     steps = _read_steps([it for it in parts(folder, STEPS_FILE) if it.name not in altered])
-    return RunFolder(folder, header, steps, header["epoch_ns"], damage)
+    added = read_added(folder, steps.num_rows)
+    names = [name for name in added.schema.names if name not in steps.schema.names]
+    for name in names:
+        steps = steps.append_column(name, added.column(name))
+    return RunFolder(folder, header, steps, header["epoch_ns"], damage, tuple(names))
 
 
 def _runs_below(folder: Path) -> str:

@@ -60,7 +60,7 @@ class LogColumns:
     """Columns of a run's log, and the numbers of a tick in their order.
 
     First stand inputs and quantities of the bench, then the struts, then the further sensors, then
-    value and standard deviation of the virtual ones (`virtual`).
+    the columns of virtual ones (`virtual`), as `StepOutput.sensors` has them.
     The indices of the channels are their positions.
     """
 
@@ -68,7 +68,7 @@ class LogColumns:
         self,
         struts: Sequence[str],
         channels: Sequence[Channel],
-        virtual: Sequence[tuple[str, str]] = (),
+        virtual: Sequence[str] = (),
     ) -> None:
         bench = [channel for channel in channels if channel.role in (Role.BENCH, Role.INPUT)]
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
@@ -87,14 +87,14 @@ class LogColumns:
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._blank = [nan] * begin_of_sensors + [nan, 0.0] * len(sensors)
         self._virtual = len(self._blank)
-        self._blank += [nan] * (2 * len(virtual))
+        self._blank += [nan] * len(virtual)
         for begin in published:  # invalid is what is sent before an estimate
             self._blank[begin + _PUBLISHED.index("valid")] = 0.0
         self.names: tuple[str, ...] = (
             *(channel.column for channel in bench),
             *(f"{strut}.{name}" for strut in struts for name in STRUT_COLUMNS),
             *(name for channel in sensors for name in (channel.column, f"{channel.name}.left_out")),
-            *(name for names in virtual for name in names),
+            *virtual,
         )
         """Names of the columns."""
 
@@ -109,9 +109,8 @@ class LogColumns:
         if output.struts:
             for columns, strut in zip(self._published, output.struts, strict=True):
                 numbers[columns] = astuple(strut)
-        for index, shown in enumerate(output.sensors):
-            column = self._virtual + 2 * index
-            numbers[column : column + 2] = shown.value, shown.std
+        if output.sensors:
+            numbers[self._virtual :] = output.sensors
         for channel in output.left_out:
             numbers[column_of[channel] + 1] = 1.0
         return numbers

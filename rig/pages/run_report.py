@@ -1,13 +1,14 @@
 """The report of a run: configuration, timing, faults and curves. One file, no network."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
+from dart_model.virtual_sensors import QUANTITIES
 from rig.bridge.values import Mode
 from rig.log.checksums import Damage, find_damage, refuse_damage
 from rig.log.follower import FORCE_ERROR, RunFollower
@@ -25,6 +26,7 @@ from rig.pages.plotted_quantities import (
     TIME_PLOTS,
     VIRTUAL_FORCE_PLOT,
     Origin,
+    PlottedQuantity,
 )
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
 from rig.run.changed_settings import read_changes
@@ -113,6 +115,7 @@ def write_run_report(
             (strut, _plots(follower, strut, index, is_only=len(struts) == 1))
             for index, strut in enumerate(struts)
         ],
+        sensor_plot=_sensor_plot(follower, header),
         timing_plot=_timing_plot(folder),
     )
     write_page(text, path)
@@ -224,6 +227,33 @@ def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> l
         "the load cell while the estimate is valid; the virtual force is what the model lacks."
     )
     return [plot(f"run-{index}", "The run", caption, panels, 1)]
+
+
+def _sensor_plot(follower: RunFollower, header: RunHeader) -> Plot | None:
+    """Plot of the virtual sensors over the time of a run; None where it has none."""
+    names: Collection[str] = header.get("config", {}).get("virtual_sensors") or {}
+    columns = [
+        column
+        for column in follower.columns
+        if column.partition(".")[0] in names and column.partition(".")[2] in QUANTITIES
+    ]
+    if not columns:
+        return None
+    window = follower.window(columns, *follower.span_s, _POINTS)
+    colour, width = _STYLES[Origin.ESTIMATED]
+    panels: list[Panel] = []
+    for column, values in zip(columns, window.values, strict=True):
+        name, _, suffix = column.partition(".")
+        unit = QUANTITIES[suffix].dimension.value.replace("^2", "²").replace("*", "·")
+        quantity = PlottedQuantity(suffix.partition("_")[0], unit, unit)
+        style = LineStyle(name, colour, (), width)
+        labels = TIME.label, f"{name}: {quantity.label}"
+        panels.append(Panel("lines", *labels, window.t_s, [style], [values], {"gaps": True}))
+    caption = (
+        "Variables of the model that follows the bench, which no sensor measured. Thinned by "
+        "minimum and maximum: no peak is lost."
+    )
+    return plot("sensors", "Virtual sensors", caption, panels, 1)
 
 
 def _timing_plot(folder: Path) -> Plot | None:

@@ -56,9 +56,9 @@ def _virtual_sensors(plan: Plan, estimator: AnyEstimator) -> VirtualSensors | No
     sensors = plan.virtual_sensors
     if not sensors:
         return None
-    of_model = {item.name: item.sensor for item in sensors if item.strut is None}
+    of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
     reader = estimator.read_model(of_model) if of_model else None
-    return VirtualSensors([item.strut for item in sensors], reader)
+    return VirtualSensors([item.place for item in sensors], reader)
 
 
 def build_plant(plan: Plan) -> AnyPlant:

@@ -301,14 +301,17 @@ def _with_published_sensors(data: object) -> object:
     if not (isinstance(sensors, dict) and isinstance(published, dict)):
         return cast("object", data)
     sensors, published = cast("_Group", sensors), cast("_Group", published)
+    signals = {
+        name: item for name, item in published.items() if name in sensors and not _is_group(item)
+    }
     entries = {
-        name: {**cast("_Group", item), "publish": published[name]}
-        if name in published and isinstance(item, dict)
+        name: {**cast("_Group", item), "publish": signals[name]}
+        if name in signals and isinstance(item, dict)
         else item
         for name, item in sensors.items()
     }
     rest = {key: value for key, value in given.items() if key != "publish"}
-    others = {name: item for name, item in published.items() if name not in sensors}
+    others = {name: item for name, item in published.items() if name not in signals}
     return {**rest, "virtual_sensors": entries, **({"publish": others} if others else {})}
 
 

@@ -161,6 +161,11 @@ class Plan:
         return tuple(channel for channel in self.channels if channel.role is Role.SENSOR)
 
     @property
+    def virtual_columns(self) -> list[str]:
+        """Columns of the virtual sensors in the log."""
+        return [column for sensor in self.virtual_sensors for column in sensor.columns]
+
+    @property
     def is_prescribed(self) -> bool:
         """Whether the motion is prescribed: a dyno."""
         return self.config.prescribed_motion is not None
@@ -559,10 +564,12 @@ class _SignalReader:
         for strut, name in enumerate(config.observers):
             for key, entry in (config.publish or {}).get(name, {}).items():
                 add(f"publish.{name}.{key}", entry, choices[key], strut)
-        for index, sensor in enumerate(sensors):
+        column = 0
+        for sensor in sensors:
             entry = config.virtual_sensors[sensor.name].publish
             if entry is not None:
-                add(f"publish.{sensor.name}", entry, publication_of(sensor), index)
+                add(f"publish.{sensor.name}", entry, publication_of(sensor), column)
+            column += len(sensor.columns)
         for group, entries, publications in (
             ("status", config.status, STATUS),
             ("timing", config.timing, TIMING),

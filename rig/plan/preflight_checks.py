@@ -20,7 +20,7 @@ from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_int
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.observability import Unknown, linear_model, observability
+from rig.closed_loop.observability import Unknown, find_corrected, linear_model, observability
 from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
 from rig.closed_loop.strut_response import (
     FAST_SPEED_M_PER_S,
@@ -112,7 +112,39 @@ def check(plan: Plan) -> list[Finding]:
         return [*findings, Finding(Severity.OK, "poles", text)]
     plant = build_plant(plan)
     dissipation = _dissipation(plan, plant)
-    return [*findings, *dissipation, *_stability(plan, plant), *_observability(plan, plant)]
+    return [
+        *findings,
+        *dissipation,
+        *_stability(plan, plant),
+        *_observability(plan, plant),
+        *_virtual_sensors(plan, plant),
+    ]
+
+
+def _virtual_sensors(plan: Plan, plant: AnyPlant) -> list[Finding]:
+    """Which virtual sensors the measured heights correct."""
+    measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
+    of_model = {it.name: it.sensor for it in plan.virtual_sensors if it.strut < 0}
+    corrected: dict[str, bool] = {}
+    if of_model:
+        rest_m = [strut.free_length_m for strut in plan.struts]
+        reader = plant.virtual_sensors(of_model)
+        found = find_corrected(plant, reader, rest_m, measured)
+        corrected = dict(zip(of_model, found, strict=True))
+    findings: list[Finding] = []
+    for item in plan.virtual_sensors:
+        is_corrected = corrected.get(item.name, False)
+        if item.strut >= 0:
+            is_corrected = item.strut in measured
+        text = (
+            "the measured heights correct it"
+            if is_corrected
+            else "no measured height corrects it, or not all of it: it is that of the model alone"
+        )
+        what = f"virtual sensor {item.name}"
+        severity = Severity.OK if is_corrected else Severity.WARNING
+        findings.append(Finding(severity, what, text))
+    return findings
 
 
 def errors(plan: Plan) -> list[Finding]:

@@ -10,7 +10,7 @@ from dart_model.spec import ModelSpec
 from dart_model.virtual_sensors import KINDS, SensedQuantity, VirtualSensor
 from rig.bridge.counts import Report
 from rig.bridge.published_quantities import Publication
-from rig.bridge.virtual_sensors import StrutSensor
+from rig.bridge.virtual_sensors import SensorPlace
 
 
 @dataclass(frozen=True)
@@ -18,18 +18,25 @@ class PlannedSensor:
     """A virtual sensor of a run.
 
     Attributes:
-        strut: What it reads of a strut; None of a body or joint.
+        strut: Index of the strut that it is of; -1 for a body or joint.
     """
 
     name: str
     sensor: VirtualSensor
     quantity: SensedQuantity
-    strut: StrutSensor | None
+    strut: int
 
     @property
-    def columns(self) -> tuple[str, str]:
-        """Columns of value and standard deviation in the log."""
+    def place(self) -> SensorPlace:
+        """What it reads, for the bridge."""
+        return SensorPlace(self.sensor.kind, self.strut, self.quantity.by_force)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns in the log of its value, and of the standard deviation where there is one."""
         column = f"{self.name}.{self.quantity.suffix}"
+        if not self.quantity.by_force:
+            return (column,)
         stem, _, unit = self.quantity.suffix.partition("_")
         return column, f"{self.name}.{stem}_std_{unit}"
 
@@ -59,13 +66,13 @@ def resolve_sensors(
         where = f"{source}: virtual_sensors.{name}"
         if name in names:
             raise InputError(f"{where}: is the name of a strut or input, expected another one")
-        strut = None
+        strut = -1
         if KINDS[item.kind].of == "strut":
             if item.target not in struts:
                 raise InputError(
                     f"{where}.{item.kind} {item.target!r}: {expected_name(item.target, struts)}"
                 )
-            strut = StrutSensor(item.kind, struts.index(item.target))
+            strut = struts.index(item.target)
         elif is_prescribed:
             raise InputError(
                 f"{where}.{item.kind}: with prescribed_motion no body moves, expected "
@@ -79,8 +86,8 @@ def resolve_sensors(
 def publication_of(sensor: PlannedSensor) -> Publication:
     """How a virtual sensor is published; zero where no model moves."""
 
-    def value(report: Report, index: int) -> float:
+    def value(report: Report, column: int) -> float:
         shown = report.output.sensors
-        return shown[index].value if shown else 0.0
+        return shown[column] if shown else 0.0
 
     return Publication(sensor.name, sensor.quantity.dimension, value, "", sensor.quantity.meaning)

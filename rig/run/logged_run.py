@@ -161,9 +161,7 @@ class _LoggedRun:
         self._plan, self._bridge, self._endpoint = plan, bridge, endpoint
         self._folder, self._control = folder, control
         self._timing = Timing.empty()
-        self._columns = LogColumns(
-            plan.strut_names, plan.channels, [it.columns for it in plan.virtual_sensors]
-        )
+        self._columns = LogColumns(plan.strut_names, plan.channels, plan.virtual_columns)
         self._priority = config.realtime.fifo_priority if granted and granted.fifo else 0
         self._machine = (
             None

@@ -4,9 +4,10 @@ The ticks, the frames of each and what the loop knew come from the log; nothing 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +24,7 @@ from rig.log.reader import RUN_SCHEMA, RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
 from rig.log.step_columns import BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows, request_of
 from rig.plan.build import build_bridge
+from rig.plan.config import VirtualSensorConfig
 from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
 from rig.run.changed_settings import changes_for_replay, no_changes
@@ -59,12 +61,19 @@ class LoggedTicks:
     flags: NDArray[np.int64]
 
 
-def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_progress) -> Replay:
+def replay(
+    folder: Path,
+    *,
+    plan: Plan | None = None,
+    sensors: Mapping[str, VirtualSensorConfig] = MappingProxyType({}),
+    progress: Progress = no_progress,
+) -> Replay:
     """Compute a run again from its frames, and compare it with its steps.
 
     Ticks whose steps a kill took are those of the rate, up to the last frame.
 
-    `plan` may be another one, such as one with a corrected model or other gains.
+    `plan` may be another one, such as one with a corrected model or other gains; `sensors` are
+    virtual sensors in addition to those of the run, whose columns come last.
 
     Raises:
         InputError: The run is damaged.
@@ -77,7 +86,13 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
             "before it had settled; replay the run with the version that logged it (0.2)"
         )
     own = plan_of_header(folder, run_folder.header)
-    plan = plan or own
+    is_own, plan = plan is None, plan or own
+    if sensors:
+        for name in sensors:
+            if name in plan.config.virtual_sensors:
+                raise InputError(f"{folder}: has a virtual sensor {name}, expected another name")
+        every = {**plan.config.virtual_sensors, **sensors}
+        plan = plan.with_config(plan.config.model_copy(update={"virtual_sensors": every}))
     bridge = build_bridge(plan, sending=False)
     try:
         frames = read_frame_columns(run_folder.frame_files, run_folder.epoch_ns)
@@ -85,9 +100,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         refuse_damage(folder, run_folder.damage)
         raise
     ticks = _ticks(run_folder, frames, plan.period_ns)
-    columns = LogColumns(
-        plan.strut_names, plan.channels, [it.columns for it in plan.virtual_sensors]
-    )
+    columns = LogColumns(plan.strut_names, plan.channels, plan.virtual_columns)
     rows = StepRows(columns.names)
     batches: list[pa.RecordBatch] = []
 
@@ -103,11 +116,11 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
 
     port = _LogPort(frames, ticks)
     # With another plan the run's own changes would undo what is tried.
-    changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
+    changes = changes_for_replay(folder, own, bridge) if is_own else no_changes
     again = port.ticks(make_batch)
     last = deque(run(bridge, again, port, keep, columns, changes), maxlen=1)
     steps = pa.Table.from_batches(batches, schema=rows.schema)
-    different = _find_differences(run_folder.steps, steps)
+    different = _find_differences(run_folder.logged_steps, steps)
     return Replay(
         steps,
         run_folder.steps.num_rows,
@@ -205,7 +218,8 @@ def _find_differences(logged: pa.Table, again: pa.Table) -> NDArray[np.intp]:
     unequal = np.zeros(count, dtype=np.bool_)
     if count == 0:
         return np.flatnonzero(unequal)
-    if logged.schema != again.schema:
+    names = again.schema.names[: len(logged.schema.names)]
+    if logged.schema != again.select(names).schema:
         raise InputError("steps.arrow: its columns are not those of the run's struts and signals")
     for name in logged.schema.names:
         a, b = (table.column(name).to_numpy()[:count] for table in (logged, again))
