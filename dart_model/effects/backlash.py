@@ -1,4 +1,4 @@
-"""Free play: a zone of heights in which a spring carries nothing."""
+"""Free play: a zone of heights in which a spring carries nothing, and contacts that are lost."""
 
 import math
 
@@ -25,6 +25,19 @@ def _free_play(
     return stiffness_n_per_m * min(max(height_m - centre_height_m, -half), half)
 
 
+def _lift_off(
+    height_m: float,
+    velocity_m_per_s: float,
+    free_length_m: float,
+    stiffness_n_per_m: float,
+    damping_n_s_per_m: float,
+    holding_force_n: float,
+) -> float:
+    own = -stiffness_n_per_m * (height_m - free_length_m) - damping_n_s_per_m * velocity_m_per_s
+    # Whatever spring and damper would pull by beyond the holding force is taken away.
+    return max(-holding_force_n - own, 0.0)
+
+
 def _centres_m(motion: Motion) -> list[float]:
     # A zone whose middle the strut does not come near is a linear spring.
     low, high = _CENTRES(motion)
@@ -42,6 +55,11 @@ def _backlash_starts(motion: Motion) -> list[Start]:
 def _free_play_starts(motion: Motion) -> list[Start]:
     gaps = [share * motion.stroke_m for share in (0.03, 0.1, 0.3)]
     return grid(_centres_m(motion), gaps)
+
+
+@moving
+def _lift_off_starts(motion: Motion) -> list[Start]:
+    return [(share * motion.force_n,) for share in (-0.1, 0.01, 0.1)]
 
 
 def _gaps(motion: Motion) -> tuple[float, float]:
@@ -83,4 +101,28 @@ FREE_PLAY = Effect(
     starts=_free_play_starts,
     bounds=_BOUNDS,
     shown=("gap_m",),
+)
+
+LIFT_OFF = Effect(
+    name="lift_off",
+    family="backlash",
+    words="a contact that is lost and met again: spring and damper push, and do not pull",
+    parameters=(
+        Parameter(
+            "holding_force_n",
+            "N",
+            -1e12,
+            1e12,
+            "pull of spring and damper at which the contact is lost: what else pushes the bodies "
+            "together, such as a preload",
+        ),
+    ),
+    force=_lift_off,
+    excitation="a motion in which the contact is lost several times",
+    reference="Goldsmith, Impact (1960), 4; Kelvin-Voigt contact",
+    scaled=(),
+    starts=_lift_off_starts,
+    bounds=within(holding_force_n=lambda m: (-100.0 * m.force_n, 100.0 * m.force_n)),
+    about_free_length=True,
+    shown=("holding_force_n",),
 )

@@ -20,6 +20,7 @@ _STRIBECK = Parameter(
     1e6,
     "velocity scale of the fall from break-away to sliding friction",
 )
+_LOAD_SHARE = Parameter("load_share", "", 0.0, 10.0, "friction as a share of the load")
 _ROUNDING = Parameter(
     "rounding_velocity_m_per_s",
     "m/s",
@@ -42,6 +43,30 @@ def _coulomb(
     velocity_m_per_s: float, coulomb_force_n: float, rounding_velocity_m_per_s: float
 ) -> float:
     return -coulomb_force_n * math.tanh(velocity_m_per_s / rounding_velocity_m_per_s)
+
+
+def _under_load(
+    velocity_m_per_s: float,
+    applied_force_n: float,
+    coulomb_force_n: float,
+    load_share: float,
+    rounding_velocity_m_per_s: float,
+) -> float:
+    level = coulomb_force_n + load_share * abs(applied_force_n)
+    return -level * math.tanh(velocity_m_per_s / rounding_velocity_m_per_s)
+
+
+def _under_spring(
+    height_m: float,
+    velocity_m_per_s: float,
+    free_length_m: float,
+    stiffness_n_per_m: float,
+    coulomb_force_n: float,
+    load_share: float,
+    rounding_velocity_m_per_s: float,
+) -> float:
+    level = coulomb_force_n + load_share * abs(stiffness_n_per_m * (height_m - free_length_m))
+    return -level * math.tanh(velocity_m_per_s / rounding_velocity_m_per_s)
 
 
 def _stribeck(
@@ -113,6 +138,12 @@ def _coulomb_starts(motion: Motion) -> list[Start]:
 
 
 @moving
+def _load_starts(motion: Motion) -> list[Start]:
+    roundings = [share * motion.speed_m_per_s for share in (0.002, 0.02)]
+    return grid([motion.force_n], [0.1, 1.0, 10.0], roundings)
+
+
+@moving
 def _stribeck_starts(motion: Motion) -> list[Start]:
     falls = [share * motion.speed_m_per_s for share in (0.05, 0.1, 0.3, 1.0)]
     roundings = [share * motion.speed_m_per_s for share in (0.01, 0.03)]
@@ -162,6 +193,36 @@ COULOMB_FRICTION = _friction(
     starts=_coulomb_starts,
     bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
     simpler=(),
+)
+
+LOAD_FRICTION = _friction(
+    name="load_friction",
+    words="dry friction that grows with the applied force",
+    parameters=(_COULOMB, _LOAD_SHARE, _ROUNDING),
+    force=_under_load,
+    excitation="motion that reverses while the applied force is large, and while it is small",
+    reference="Waiboer, Aarts, Jonker, Velocity dependence of joint friction in robotic "
+    "manipulators with gear transmissions, Multibody Dynamics (2005): a gear's grows with its load",
+    scaled=(0, 1),
+    starts=_load_starts,
+    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
+    benches=("force_given",),
+    shown=("coulomb_force_n", "load_share"),
+)
+
+SPRING_LOAD_FRICTION = _friction(
+    name="spring_load_friction",
+    words="dry friction that grows with the force of the spring",
+    parameters=(_COULOMB, _LOAD_SHARE, _ROUNDING),
+    force=_under_spring,
+    excitation="motion that reverses at several heights",
+    reference="Dixon, The Shock Absorber Handbook (2007), 1: the side load of a strut, and with it "
+    "the friction of its guides, is proportional to the force of its spring",
+    scaled=(0, 1),
+    starts=_load_starts,
+    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
+    shown=("coulomb_force_n", "load_share"),
+    about_free_length=True,
 )
 
 STRIBECK_FRICTION = _friction(

@@ -77,7 +77,11 @@ CLOSED_FORMS = [
     ("hertz_end_stops", [0.4, 0.6, 1e5, 0.0], {"height": 0.39}, 100.0),
     ("backlash", [1e3, 0.02, 0.5], {"height": 0.53}, -20.0),
     ("free_play", [0.5, 0.02], {"height": 0.53}, 5.0),
+    # The spring of 500 N/m pulls by 15 N, of which 2.5 N are held.
+    ("lift_off", [2.5], {"height": 0.53}, 12.5),
     ("coulomb_friction", [9.0, 0.01], {"velocity": 1.0}, -9.0),
+    ("load_friction", [4.0, 0.5, 0.01], {"velocity": 1.0, "applied": -20.0}, -14.0),
+    ("spring_load_friction", [4.0, 0.5, 0.01], {"velocity": -1.0, "height": 0.53}, 11.5),
     ("stribeck_friction", [9.0, 2.0, 1.0, 1e-3], {"velocity": 1.0}, -9.0 * (1.0 + math.exp(-1.0))),
     ("presliding_friction", [9.0, 1e-4], {"state": (0.5,)}, -4.5),
     ("elastoplastic_friction", [9.0, 1e-4], {"state": (1.2,)}, -9.0),

@@ -9,8 +9,11 @@ References:
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from dart_model.effects import effect
-from rig.diagnosis.problem.problem import Candidate, StrutEffect, nominal
+from dart_model.effects.backlash import LIFT_OFF
+from rig.diagnosis.problem.problem import Candidate, StrutEffect, nominal, strut_constants
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
 from rig.diagnosis.search.fit import law_values, model_for
@@ -36,6 +39,10 @@ _REST_AFTER_TURN = 0.6
 """Share of the work that is left after one more expansion: there are mostly two to four."""
 
 
+_SELDOM = 0.01
+"""Share of the time in which a strut has to pull for a contact to be lost in it."""
+
+
 class FirstRound(NamedTuple):
     """Single laws with the linear part along the motion, best first, and no law at all."""
 
@@ -53,12 +60,14 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
         _expand_best(pool, progress)
         known = pool.least().fit.candidate
         _try_damper_with_friction(pool)
+        _try_lost_contacts(pool)
         if pool.least().fit.candidate != known:
             # Its other laws were chosen beside a damper or friction that imitated both.
             _expand_best(pool, progress)
     else:
         first = _search_along_motion(pool, progress)
         _try_damper_with_friction(pool)
+        _try_lost_contacts(pool)
     pool.converge_best()
     return first
 
@@ -111,6 +120,31 @@ def _try_damper_with_friction(pool: Pool) -> None:
         screening = screen_damper_with_friction(pool.linear_stage, base, strut)
         if screening is not None:
             pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
+
+
+def _try_lost_contacts(pool: Pool) -> None:
+    """Fit a contact that lifts off in a strut whose spring and damper would pull.
+
+    The best linear model of such a strut is far from its spring and damper, which the law reads:
+    the fit begins at those of the model.
+    """
+    if pool.at_floor(pool.least()):
+        return
+    problem = pool.problem
+    constants = strut_constants(problem, np.zeros(len(problem.linear)))
+    for strut in range(len(problem.motions)):
+        law = (strut, LIFT_OFF.name)
+        free_m, stiffness, damping = constants[strut, :3]
+        pulls = [
+            -stiffness * (track.heights_m[strut] - free_m)
+            - damping * track.velocities_m_per_s[strut]
+            < 0.0
+            for _, track in pool.along
+        ]
+        share = float(np.mean(np.concatenate(pulls)))
+        candidate = nominal(problem).with_effects(law)
+        if _SELDOM < share < 1.0 and candidate not in pool.converged:
+            pool.attempt_at_nominal(candidate, {law: np.array([0.0])})
 
 
 def _screen_single_laws(pool: Pool, progress: Progress) -> FirstRound:

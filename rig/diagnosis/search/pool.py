@@ -5,7 +5,7 @@ one-standard-error rule.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -182,6 +182,13 @@ class Pool:
         model, none_free = CandidateModel(candidate, parts), np.zeros(len(linear), dtype=np.bool_)
         result = fit(self.problem, model, none_free, _STARTS, effects=False)
         return model if result is None else result.model
+
+    def attempt_at_nominal(self, candidate: Candidate, laws: Mapping[StrutEffect, Array]) -> None:
+        """Fit laws in simulation, from the linear part of the nominal model on."""
+        values = [existing_values(self.problem, nominal(self.problem))]
+        values += [laws[law] for law in candidate.new]
+        linear = np.array([p.expected for p in self.problem.linear])
+        self.attempt(self._fit_starts(candidate, linear, np.concatenate(values)), FULL)
 
     def adopt(self, result: Fit) -> None:
         """Fit the laws of a model of other recordings, starting from its parameters."""

@@ -91,8 +91,9 @@ def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
         space.logarithmic, np.log(UNBOUND), np.abs(result.solution.values) / space.scale
     )
     for row, name in new_laws(result):
-        scaled = variables[row][list(effect(name).scaled or (0,))]
-        if not np.any(half[scaled] < sizes[scaled]):
+        scaled = variables[row][list(effect(name).scaled)]
+        # One without a size of its own takes that of the strut.
+        if len(scaled) and not np.any(half[scaled] < sizes[scaled]):
             return f"its size is not identifiable from these data ({name})"
     return None
 
