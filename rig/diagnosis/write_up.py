@@ -65,6 +65,8 @@ run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integ
 _OF_SAMPLING = 0.01
 """Half-width that the interval of a delay has at least, as a share of the time between samples:
 between them the motion is a cubic, and a law that switches is not."""
+_LIKE = 0.01
+"""Difference of two shares up to which they count as one, however narrow their intervals."""
 _HOLD = 0.3
 """Share of half a sampling interval within which a delay may be that of a zero-order hold."""
 
@@ -153,6 +155,7 @@ def compose_result(
             is_white(problem, chosen, criteria.white),
         ),
         _notes(problem, search, by_blocks=by_blocks)
+        + _notes_of_zero_and_gain(problem, estimates)
         + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
         + _notes_of_channels(channels)
         + _notes_of_bounds(problem, estimates)
@@ -480,6 +483,36 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "No run was held out: blocks spread over the recordings took no part in the search; "
             "the initial states are those of the fit."
         )
+    return tuple(notes)
+
+
+def _notes_of_zero_and_gain(problem: Problem, estimates: FitEstimates) -> tuple[str, ...]:
+    """Corrections of the model that a wrong zero or gain of a channel would cause as well."""
+    notes: list[str] = []
+    is_dyno = problem.bench == "motion_given"
+    free, implied = _free(problem, estimates.fit), _find_preload_of_springs(problem, estimates)
+    if any(p.kind == "preload" and i not in implied for i, p in enumerate(free)):
+        channel = "the load cell" if is_dyno else "the applied force or the height"
+        notes.append(
+            f"A preload has the same effect as a wrong zero of {channel}: check the zero before "
+            "the preload is believed."
+        )
+    shares: dict[int, list[tuple[float, float]]] = {}
+    for variable, p in enumerate(free if is_dyno else ()):
+        if p.kind in ("stiffness", "damping") and p.nominal > 0.0:
+            value = float(estimates.fit.solution.values[variable])
+            half = float(estimates.covariance.half[variable]) * p.deviation
+            shares.setdefault(p.strut, []).append((value / p.nominal, half / p.nominal))
+    for strut, found in shares.items():
+        if len(found) == 2 and abs(found[0][0] - found[1][0]) < max(
+            found[0][1] + found[1][1], _LIKE
+        ):
+            share = float(np.mean([item for item, _ in found]))
+            notes.append(
+                f"Stiffness and damping of strut {problem.spec.struts[strut].name} differ by the "
+                f"same share ({100.0 * share:+.2g} %): a load cell whose gain is wrong by it has "
+                "the same effect."
+            )
     return tuple(notes)
 
 

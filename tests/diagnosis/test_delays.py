@@ -232,3 +232,16 @@ def test_a_late_load_cell_of_a_driven_bench_is_found_by_the_corrected_model(late
     (channel,) = found.channels
     assert channel.channel == "strut_force_n:strut"
     assert channel.total.value == pytest.approx(1e-3 * late_ms, abs=1e-4)
+
+
+def test_a_wrong_zero_and_a_wrong_gain_of_a_load_cell_are_pointed_out():
+    def seen(seed, gain, zero_n):
+        run = dyno.run(dyno.Nothing(), seed=seed)
+        return replace(run, strut_forces_n=gain * run.strut_forces_n + zero_n)
+
+    found = diagnose(dyno.model(), [seen(1, 1.0, 25.0)], [seen(2, 1.0, 25.0)]).diagnosis
+    assert any("a wrong zero of the load cell" in note for note in found.notes)
+    assert not any("gain" in note for note in found.notes)
+    found = diagnose(dyno.model(), [seen(1, 1.06, 0.0)], [seen(2, 1.06, 0.0)]).diagnosis
+    (note,) = [note for note in found.notes if "gain" in note]
+    assert "differ by the same share (+6 %)" in note
