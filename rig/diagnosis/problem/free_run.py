@@ -296,7 +296,25 @@ class FreeRunProblem(Problem):
             disturbed = self.simulate(run.disturbed(noise), model, start)
             if disturbed is not None:
                 disturbances.append(disturbed.heights_m - motion.heights_m)
+        if run.drive.moved and disturbances:
+            return _without(self._free_motions(run, model, start, motion), disturbances)
         return disturbances
+
+    def _free_motions(
+        self, run: DrivenRun, model: CandidateModel, start: Array, motion: Trajectory
+    ) -> Array:
+        """Change of the heights by each coordinate and velocity at the start, (N * struts, 2 n).
+
+        A fit determines the start along with the noise: what the noise of a moved body does to the
+        velocity at the start is not left.
+        """
+        scales, _ = self.start_scales(model.candidate)
+        columns: list[Array] = []
+        for i in range(2 * run.mechanism.coordinates):
+            moved = self.simulate(run, model, start + scales[i] * np.eye(len(start))[i])
+            if moved is not None:
+                columns.append((moved.heights_m - motion.heights_m).ravel() / scales[i])
+        return np.column_stack(columns) if columns else np.zeros((motion.heights_m.size, 0))
 
     # --- the residual force -----------------------------------------------------------------------
 
@@ -609,6 +627,13 @@ class FreeRunProblem(Problem):
                 delay = delay_between(cells_n[:, i], course, run.grid.step_s)
                 found.setdefault(i, []).append(delay)
         return {i: _weighted_mean(delays) for i, delays in found.items()}
+
+
+def _without(columns: Array, signals: Sequence[Array]) -> list[Array]:
+    """Signals without what columns (m, k) can give of them, in their own shapes."""
+    basis = np.linalg.qr(columns)[0]
+    rows = [(signal.shape, signal.ravel()) for signal in signals]
+    return [(row - basis @ (basis.T @ row)).reshape(shape) for shape, row in rows]
 
 
 def _weighted_mean(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
