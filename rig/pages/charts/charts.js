@@ -256,7 +256,12 @@ const Charts = (() => {
   const drawn = (draw) => (u, index) => {
     uPlot.orient(u, index, (series, _x, _y, scaleX, scaleY, posX, posY, left, top, wide, high) => {
       const [xs, ys] = u.data[index];
-      const at = (i) => [posX(xs[i], scaleX, wide, left), posY(ys[i], scaleY, high, top)];
+      // Null would be the place of zero.
+      const known = (v) => v ?? NaN;
+      const at = (i) => {
+        const x = posX(known(xs[i]) + 0 * known(ys[i]), scaleX, wide, left);
+        return [x, posY(known(ys[i]), scaleY, high, top)];
+      };
       const ctx = u.ctx;
       ctx.save();
       ctx.beginPath();
@@ -300,6 +305,7 @@ const Charts = (() => {
     let high = -Infinity;
     for (const list of values) {
       for (const v of list) {
+        if (v === null) continue;
         if (v < low) low = v;
         if (v > high) high = v;
       }
