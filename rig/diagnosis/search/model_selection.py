@@ -31,6 +31,8 @@ Flags = NDArray[np.bool_]
 
 _SCALED_BY_GAIN = ("mass", "stiffness", "damping")
 """Linear parameters that, changed in one proportion, are another gain of the applied force."""
+_MORE_FITS, _STILL_FALLING = 3, 0.95
+"""Fits of a simpler model in addition, as long as each reduces its cost by a twentieth."""
 _ALIKE = 0.01
 """Difference of two shares up to which they count as one, however narrow their intervals."""
 
@@ -155,8 +157,23 @@ def _converge_candidate(
     """A candidate's model, converged if it is near the chosen one; empty without a valid fit."""
     if candidate in pool.fits:
         pool.converge(pool.fits[candidate], chosen)
+        _continue_while_it_helps(pool, candidate, chosen)
         if candidate not in pool.invalid:
             yield pool.fits[candidate]
+
+
+def _continue_while_it_helps(pool: Pool, candidate: Candidate, chosen: ValidatedModel) -> None:
+    """Fit a simpler model on, while its steps are short and it is not yet as good as a chosen one.
+
+    Where a contact moves, steps are short for many iterations.
+    """
+    for _ in range(_MORE_FITS):
+        before = pool.fits[candidate]
+        if not (pool.is_near(before, chosen) and pool.prefers(chosen, before)):
+            return
+        pool.attempt(before.fit.model, FULL)
+        if pool.fits[candidate].cost > _STILL_FALLING * before.cost:
+            return
 
 
 def _attempt_plainer(pool: Pool, unidentified: ValidatedModel) -> None:
