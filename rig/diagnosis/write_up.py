@@ -301,7 +301,7 @@ def _linear_effects(
     after: Sequence[ResidualForces | None],
     channels: Sequence[ChannelCorrection],
 ) -> tuple[FoundEffect, ...]:
-    """Delays as effects, and where there are no laws, all linear corrections."""
+    """Delays as effects, and where nothing else was found, all linear corrections."""
     result = estimates.fit
     late = {item.channel for item in channels if item.is_late}
     effects: list[FoundEffect] = []
@@ -311,7 +311,8 @@ def _linear_effects(
         if p.kind == "delay":
             is_effect = p.channel in late
         else:
-            is_effect = not result.candidate.new and p.kind in EFFECTS and variable not in implied
+            is_alone = not (result.candidate.new or late)
+            is_effect = is_alone and p.kind in EFFECTS and variable not in implied
         if not is_effect:
             continue
         linear = result.parts.linear.copy()
