@@ -195,33 +195,32 @@ COULOMB_FRICTION = _friction(
     simpler=(),
 )
 
-LOAD_FRICTION = _friction(
+_friction_under = partial(
+    _friction,
+    parameters=(_COULOMB, _LOAD_SHARE, _ROUNDING),
+    scaled=(0, 1),
+    starts=_load_starts,
+    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
+    shown=("coulomb_force_n", "load_share"),
+)
+
+LOAD_FRICTION = _friction_under(
     name="load_friction",
     words="dry friction that grows with the applied force",
-    parameters=(_COULOMB, _LOAD_SHARE, _ROUNDING),
     force=_under_load,
     excitation="motion that reverses while the applied force is large, and while it is small",
     reference="Waiboer, Aarts, Jonker, Velocity dependence of joint friction in robotic "
     "manipulators with gear transmissions, Multibody Dynamics (2005): a gear's grows with its load",
-    scaled=(0, 1),
-    starts=_load_starts,
-    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
     benches=("force_given",),
-    shown=("coulomb_force_n", "load_share"),
 )
 
-SPRING_LOAD_FRICTION = _friction(
+SPRING_LOAD_FRICTION = _friction_under(
     name="spring_load_friction",
     words="dry friction that grows with the force of the spring",
-    parameters=(_COULOMB, _LOAD_SHARE, _ROUNDING),
     force=_under_spring,
     excitation="motion that reverses at several heights",
     reference="Dixon, The Shock Absorber Handbook (2007), 1: the side load of a strut, and with it "
     "the friction of its guides, is proportional to the force of its spring",
-    scaled=(0, 1),
-    starts=_load_starts,
-    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
-    shown=("coulomb_force_n", "load_share"),
     about_free_length=True,
 )
 

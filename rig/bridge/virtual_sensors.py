@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _OF_STRUT = {"force_of": (0, 1), "power_of": (2, 3), "energy_of": (4, None)}
 """Places of value and standard deviation among the numbers of a strut."""
 _STRUT_NUMBERS = 5
+"""Of each strut: force and power, each with its standard deviation, and energy."""
 
 
 class SensorPlace(NamedTuple):

@@ -82,7 +82,7 @@ def replay_command(
         if result.different:
             console.print("The replay differs from the log.", style="red")
         if sensors:
-            _print_sensors(folder, result.steps.schema.names, sensors)
+            _print_sensors(folder, result, sensors)
     refuse_damage(folder, result.damage)
     if result.different or changed or result.steps.num_rows == 0:
         raise typer.Exit(FAILED)
@@ -126,15 +126,15 @@ def _keep_sensors(folder: Path, result: "Replay", sensors: Mapping[str, object])
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
-def _print_sensors(folder: Path, names: Sequence[str], sensors: Mapping[str, object]) -> None:
+def _print_sensors(folder: Path, result: "Replay", sensors: Mapping[str, object]) -> None:
     import numpy as np
 
-    from rig.formats.run_arrays import open_run
     from rig.log.file_names import ADDED_FILE
 
-    run, rows = open_run(folder), list[tuple[str, ...]]()
-    for name in _columns_of(names, sensors):
-        values = run.columns[name][np.isfinite(run.columns[name])]
+    rows: list[tuple[str, ...]] = []
+    for name in _columns_of(result.steps.schema.names, sensors):
+        values = result.steps[name].to_numpy()
+        values = values[np.isfinite(values)]
         if len(values) and "_std_" not in name:
             figures = values.mean(), values.std(), values.min(), values.max()
             rows.append((name, *(f"{it:.4g}" for it in figures)))

@@ -317,7 +317,7 @@ def _linear_effects(
             continue
         linear = result.parts.linear.copy()
         linear[index] = 0.0
-        nominal = result.model._replace(parts=result.parts._replace(linear=linear))
+        nominal = result.model.with_linear(linear)
         forces: list[Array] = []
         residuals: list[Array] = []
         for k, corrected in enumerate(after):

@@ -1,4 +1,4 @@
-"""Late channels are found beside effects, and are told from them where the motion allows it."""
+"""Late channels are found along with effects, and separated from them where motion allows it."""
 
 import random
 from dataclasses import replace

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from rig.diagnosis.numerics.delay_step import DelayStep, ForceOverTime, delay_step
 from rig.diagnosis.problem.channel_delays import LONGEST_S, SIGNIFICANT
 from rig.diagnosis.problem.problem import (
-    CandidateModel,
     LinearParameter,
     Problem,
     first_starts,
@@ -20,6 +19,7 @@ from rig.diagnosis.problem.problem import (
 Array = NDArray[np.float64]
 
 _ITERATIONS = 6
+"""Most steps; the fit that follows searches about what they reach."""
 _WIDTH, _LEAST_WIDTH_S = 5.0, 0.5e-3
 """Standard deviations about an estimate, and least time, within which a delay is searched for: the
 functions of the estimate bend less than a stop, whose contact it takes for 0.1 ms."""
@@ -62,7 +62,7 @@ def _step(problem: Problem, which: Sequence[int], delays_s: Array) -> DelayStep 
     base = nominal_model(problem, first_starts(problem, nominal(problem)))
     linear = base.parts.linear.copy()
     linear[list(which)] = delays_s
-    model = CandidateModel(base.candidate, base.parts._replace(linear=linear))
+    model = base.with_linear(linear)
     stride = max(1, sum(len(grid.t_s) for grid in problem.grids) // _MOST_SAMPLES)
     recordings: list[Sequence[ForceOverTime]] = []
     for k, grid in enumerate(problem.grids):

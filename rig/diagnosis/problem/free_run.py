@@ -357,8 +357,7 @@ class FreeRunProblem(Problem):
             for sign in (1.0, -1.0):
                 linear = model.parts.linear.copy()
                 linear[delay] += sign * step_s
-                parts = model.parts._replace(linear=linear)
-                moved = self._needed_forces(k, model._replace(parts=parts))
+                moved = self._needed_forces(k, model.with_linear(linear))
                 if moved is None:
                     return None
                 ends.append(moved[1])
@@ -435,7 +434,7 @@ class FreeRunProblem(Problem):
                 continue
             linear = model.parts.linear.copy()
             linear[index] += _DELAY_STEP_S
-            later = model._replace(parts=model.parts._replace(linear=linear))
+            later = model.with_linear(linear)
             moved = self.simulate(self._before_delays(k, later), later, later.parts.starts[k])
             if moved is None:
                 raise FloatingPointError(self.runs[k].grid.name)
@@ -604,13 +603,17 @@ class FreeRunProblem(Problem):
         cells = np.where(evaluated[:, np.newaxis], cells_n, np.nan)
         errors: list[float] = []
         for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
-            along = track_of(motion, self._before_delays(k, model))
-            forces = track.strut_forces(self, model, along, self.states(k, model))
-            at = np.column_stack([np.interp(t_s, run.grid.t_s, force) for force in forces])
+            at = self._forces_at(t_s, k, model, motion)
             if model is models.corrected:
                 at = _late_as(cells, at, run.grid.step_s)
             errors.append(rms(cells - at))
         return BeforeAfter(*errors)
+
+    def _forces_at(self, t_s: Array, k: int, model: CandidateModel, motion: Trajectory) -> Array:
+        """Forces (N, struts) of a model along a motion of its own, at times (N,)."""
+        along = track_of(motion, self._before_delays(k, model))
+        forces = track.strut_forces(self, model, along, self.states(k, model))
+        return np.column_stack([np.interp(t_s, self.runs[k].grid.t_s, force) for force in forces])
 
     def delays_of_cells(self, model: CandidateModel) -> dict[int, tuple[float, float]]:
         """Delay in s of each strut's load cell against a model, and its standard deviation."""
@@ -619,12 +622,10 @@ class FreeRunProblem(Problem):
             motion = self.simulate(self._before_delays(k, model), model, model.parts.starts[k])
             if run.cells is None or motion is None or any(self.plants.plain.mockups):
                 return {}
-            along = track_of(motion, self._before_delays(k, model))
-            forces = track.strut_forces(self, model, along, self.states(k, model))
             t_s, cells_n = run.cells
+            forces = self._forces_at(t_s, k, model, motion)
             for i in np.flatnonzero(np.isfinite(cells_n).any(axis=0)).tolist():
-                course = np.interp(t_s, run.grid.t_s, forces[i])
-                delay = delay_between(cells_n[:, i], course, run.grid.step_s)
+                delay = delay_between(cells_n[:, i], forces[:, i], run.grid.step_s)
                 found.setdefault(i, []).append(delay)
         return {i: _weighted_mean(delays) for i, delays in found.items()}
 

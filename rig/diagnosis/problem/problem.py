@@ -112,6 +112,10 @@ class CandidateModel(NamedTuple):
     candidate: Candidate
     parts: Parts
 
+    def with_linear(self, linear: Array) -> "CandidateModel":
+        """The same model with other linear parameters, shape (L,)."""
+        return self._replace(parts=self.parts._replace(linear=linear))
+
 
 class ComparedModels(NamedTuple):
     """The models that are compared on held-out data."""

@@ -268,7 +268,7 @@ def _with_delays_instead(
     for dropped in (corrected, *([i] for i in corrected)):
         linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
         linear[list(dropped)], free[list(dropped)], free[list(unknown)] = 0.0, False, True
-        first = CandidateModel(chosen.fit.candidate, chosen.fit.parts._replace(linear=linear))
+        first = chosen.fit.model.with_linear(linear)
         result = fit(pool.problem, first, free, FINAL)
         if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
             return rival
@@ -286,9 +286,7 @@ def _with_memory_instead(
     candidate = chosen.fit.candidate.with_effects(law)
     if candidate == chosen.fit.candidate:
         return None
-    plain = chosen.fit._replace(
-        model=CandidateModel(chosen.fit.candidate, chosen.fit.parts._replace(linear=linear))
-    )
+    plain = chosen.fit._replace(model=chosen.fit.model.with_linear(linear))
     for start in MAXWELL.starts(pool.problem.motions[strut]):
         first = model_for(pool.problem, plain, candidate, {law: np.array(start)})
         result = fit(pool.problem, first, free, FINAL)
