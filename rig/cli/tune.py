@@ -150,7 +150,7 @@ def tune_command(
         print_json([_as_dict(strut) for strut in struts])
         return
     for strut in struts:
-        _print(strut, damping_ratio, _cycle_of_applied_force_ms(plan))
+        _print(strut, damping_ratio)
     for path in (out, plot):
         if path is not None:
             print_text(f"Written: {path}")
@@ -202,13 +202,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
     }
 
 
-def _cycle_of_applied_force_ms(plan: "Plan") -> float:
-    """Longest cycle of a message with a force or torque that drives the bench; 0 without one."""
-    driving = (item.channel for item in plan.inputs if not item.is_motion)
-    return 1e-6 * max((it.interval_ns for it in driving if it is not None), default=0)
-
-
-def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> None:
+def _print(strut: "TunedStrut", damping_ratio: float) -> None:
     from rig.tuning.gains import LEAST_IN_MOTION
     from rig.tuning.tune import settings_of
 
@@ -228,7 +222,7 @@ def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> 
             "contain this part. A shorter cycle of its message reduces it."
         )
     if strut.latency is not None:
-        _print_latency(strut.latency, force_cycle_ms, is_set=bool(strut.delay_s))
+        _print_latency(strut.latency, is_set=bool(strut.delay_s))
     slowest = ", ".join(
         f"{pole.frequency_hz:.3g} Hz with {pole.damping_ratio:.2f}"
         for pole in chosen.expected.poles[:6]
@@ -263,28 +257,20 @@ def _print(strut: "TunedStrut", damping_ratio: float, force_cycle_ms: float) -> 
         )
 
 
-def _print_latency(latency: "Latency", force_cycle_ms: float, *, is_set: bool) -> None:
+def _print_latency(latency: "Latency", *, is_set: bool) -> None:
     low_ms, value_ms, high_ms = (
         1e3 * it for it in (latency.low_s, latency.delay_s, latency.high_s)
     )
     if latency.std_s == float("inf"):
         console.print(
             "Latency of the height: cannot be determined from this run; it contains a single "
-            "frequency, or too little that the observer follows. Record a sweep or a multisine."
+            "frequency, or too little motion. Record a sweep or a multisine."
         )
-    elif high_ms < 0.0 and not force_cycle_ms:
-        print_text("Latency of the height: none.")
     elif high_ms < 0.0:
         print_text(
-            f"Latency of the height: none. In the loop, the applied force acts {-value_ms:.3g} ms "
-            f"late (95 %: {-high_ms:.3g} to {-low_ms:.3g} ms). At a tick, its newest sample is up "
-            f"to one cycle of its message old ({force_cycle_ms:.3g} ms), without a fault of the "
-            "sensor. "
-            + (
-                "The rest is a delay of the sensor, its filter or the bus."
-                if -high_ms > force_cycle_ms
-                else "Nothing is to be set."
-            )
+            f"Latency of the height: none. The applied force is {-value_ms:.3g} ms later than the "
+            f"height (95 %: {-high_ms:.3g} to {-low_ms:.3g} ms): a delay of its sensor, its filter "
+            "or the bus."
         )
     else:
         verdict = "" if is_set else "; indistinguishable from zero, so none is set"

@@ -49,7 +49,7 @@ from rig.tuning.gains import (
     sweep_bandwidth,
     tune_observer,
 )
-from rig.tuning.latency import Latency, estimate_latency, with_delay
+from rig.tuning.latency import Latency, estimate_latencies, with_delay
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
 """Of the bandwidths that are plotted: from a sixth to six times the choice."""
@@ -132,14 +132,16 @@ def tune(
         progress("the run with this model", 0.0)
         loops = _follow_with_own_model(loops, recorded, source, aim)
     tuned: list[TunedStrut] = []
-    for index, strut in enumerate(plan.struts):
+    progress("latency", 0.0)
+    latencies = _latencies(plan, source)
+    for index, (strut, latency) in enumerate(zip(plan.struts, latencies, strict=True)):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
         part = within(progress, *share, of=strut.name)
-        latency, delay_s = _find_delay(loops, index, source, aim, part)
+        delay_s = _delay_s(plan, strut.name, latency)
         problem = loops.problem(index, delay_s)
-        part("gains", 0.7)
+        part("gains", 0.2)
         chosen = tune_observer(problem, kind, aim)
-        part("other bandwidths", 0.9)
+        part("other bandwidths", 0.7)
         published = paper_observer(problem.mobility_per_kg, problem.force_limit_n)
         tuned.append(
             TunedStrut(
@@ -232,36 +234,20 @@ class _Loops(NamedTuple):
         )
 
 
-def _find_delay(
-    loops: _Loops, index: int, source: Path | StatedExpectation, aim: Aim, progress: Progress
-) -> tuple[Latency | None, float]:
-    """Latency of a height as the run shows it, None where it is given, and the delay to tune with.
+def _latencies(plan: Plan, source: Path | StatedExpectation) -> list[Latency | None]:
+    """Latencies of the heights as the run shows them; None where there is none, or one is given."""
+    given_s = [plan.config.signals.height[strut].delay_s for strut in plan.strut_names]
+    if not isinstance(source, Path) or all(given_s):
+        return [None] * len(given_s)
+    found = estimate_latencies(source, plan.model, plan.strut_names)
+    return [None if given else latency for given, latency in zip(given_s, found, strict=True)]
 
-    The configuration gives the delay, or the run does where that gives none.
-    """
-    plan = loops.plan
-    strut = plan.struts[index].name
-    delay_s = plan.config.signals.height[strut].delay_s
-    if delay_s or not isinstance(source, Path):
-        return None, delay_s
-    # The run's own signals and bus, with the model that is tuned.
-    own = plan_of_run(source).with_model(plan.model)
 
-    def follow(delay_s: float) -> KalmanObserver:
-        tuned = tune_observer(loops.problem(index, delay_s), "kalman", aim)
-        return cast("KalmanObserver", tuned.observer)
-
-    latency = estimate_latency(
-        source,
-        own,
-        strut,
-        dict(zip(plan.strut_names, loops.mobility_per_kg[index].tolist(), strict=True)),
-        follow,
-        lambda share: progress("latency", 0.7 * share),
-    )
-    if latency.low_s > 0.0:
-        delay_s = float(f"{latency.delay_s:.3g}")
-    return latency, delay_s
+def _delay_s(plan: Plan, strut: str, latency: Latency | None) -> float:
+    """The delay to tune with: the configuration's, or the one that the run shows."""
+    if latency is None:
+        return plan.config.signals.height[strut].delay_s
+    return float(f"{latency.delay_s:.3g}") if latency.low_s > 0.0 else 0.0
 
 
 def write_config(plan: Plan, tuned: list[TunedStrut], path: Path, model: str | None = None) -> None:

@@ -36,10 +36,10 @@ _ITERATIONS = 8
 _RANK = 1e-9
 """Eigenvalues below this share of the largest are rounding: of the functions some are alike."""
 
-_FRICTION_OF_STROKE = (1e-3, 1e-2, 5e-2)
+_FRICTION_OF_STROKE = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 """Displacements over which dry friction reverses, as shares of the stroke: presliding of tens of
 micrometres to a soft seal. Without friction among the functions, its hysteresis is taken for a
-delay."""
+delay; with only three of them, some 0.1 ms of it were."""
 
 _LEAST_SHARE = 0.03
 """Of the derivative's power that the functions must not be able to give. Of one sine they leave

@@ -91,7 +91,9 @@ def delays_of(
 def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array) -> Array:
     """Columns (N, k) as they are seen with a delay (s) each, shape (k,).
 
-    Between times they are cubic, through their rates of change (N, k) where these are given.
+    Between times they are cubic, through their rates of change (N, k) where these are given; before
+    and after them they go on at these rates, else they stay. (A motion that stops dead at its end
+    has a bend there, which no smoothing takes for noise.)
     """
     late = values
     for column, delay_s in enumerate(delays_s.tolist()):
@@ -100,11 +102,13 @@ def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array
         if late is values:
             late = values.copy()
         own = np.ascontiguousarray(values[:, column])
+        known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
         if rates is None:
-            course = CubicSpline(t_s, own)
+            late[:, column] = CubicSpline(t_s, own)(known_s)
         else:
-            course = CubicHermiteSpline(t_s, own, np.ascontiguousarray(rates[:, column]))
-        late[:, column] = course(np.clip(t_s - delay_s, t_s[0], t_s[-1]))
+            rate = np.ascontiguousarray(rates[:, column])
+            beyond = (t_s - delay_s - known_s) * np.where(known_s > t_s[0], rate[-1], rate[0])
+            late[:, column] = CubicHermiteSpline(t_s, own, rate)(known_s) + beyond
     return late
 
 

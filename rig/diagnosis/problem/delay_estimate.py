@@ -31,6 +31,18 @@ _MOST_SAMPLES = 40_000
 
 def with_estimated_delays(problem: Problem) -> Problem:
     """The problem whose delays are searched about first estimates of them."""
+    found = estimate_delays(problem)
+    linear = tuple(
+        _about(p, *found[p.channel]) if p.channel in found else p for p in problem.linear
+    )
+    return replace(problem, linear=linear)
+
+
+def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
+    """First estimates of the delays that the recordings determine, by their channels.
+
+    Each is an estimate and its standard deviation in s.
+    """
     which = [i for i, p in enumerate(problem.linear) if p.kind == "delay"]
     delays_s, stds_s = np.zeros(len(which)), np.full(len(which), np.inf)
     for _ in range(_ITERATIONS if which else 0):
@@ -41,11 +53,8 @@ def with_estimated_delays(problem: Problem) -> Problem:
         before_s, delays_s = delays_s, np.clip(delays_s + step.steps_s, -LONGEST_S, LONGEST_S)
         if np.all(np.abs(delays_s - before_s) < 0.1 * stds_s):
             break
-    linear = list(problem.linear)
-    for i, delay_s, std_s in zip(which, delays_s.tolist(), stds_s.tolist(), strict=True):
-        if np.isfinite(std_s):
-            linear[i] = _about(linear[i], delay_s, std_s)
-    return replace(problem, linear=tuple(linear))
+    estimates = zip(which, delays_s.tolist(), stds_s.tolist(), strict=True)
+    return {problem.linear[i].channel: (d, std) for i, d, std in estimates if np.isfinite(std)}
 
 
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
