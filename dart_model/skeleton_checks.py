@@ -17,7 +17,7 @@ from dart_model.skeleton_xml import Element, read_xml, walk
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 _OF_MJCF: Mapping[str, int] = {
-    **dict.fromkeys(("pos", "axis", "euler", "zaxis", "diaginertia", "scale"), 3),
+    **dict.fromkeys(("pos", "axis", "euler", "zaxis", "diaginertia", "scale", "anchor"), 3),
     **dict.fromkeys(("gravity", "wind", "magnetic"), 3),
     **dict.fromkeys(("quat", "axisangle", "rgba"), 4),
     **dict.fromkeys(("xyaxes", "fromto", "fullinertia"), 6),

@@ -3,7 +3,7 @@
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal
@@ -109,14 +109,43 @@ class BodySpec(_Frozen):
     inertia_kg_m2: tuple[Positive, Positive, Positive] | None = None
 
 
+class LoopSpec(_Frozen):
+    """A joint that closes a chain of bodies: the two bodies have a point in common.
+
+    Attributes:
+        between: The two bodies; either may be `world`.
+        at: The common point, in the frame of the first body. In the second body it is the point
+            that lies there when all joint coordinates are zero.
+        type: `ball`: the bodies turn freely about the point; or `revolute`: about an axis through
+            it.
+        axis: Axis of a revolute joint in the frame of the first body, of any length.
+    """
+
+    between: tuple[Name, Name]
+    at: Vector
+    type: Literal["ball", "revolute"]
+    axis: Axis | None = None
+
+    @model_validator(mode="after")
+    def _joins_two_bodies(self) -> "LoopSpec":
+        if self.between[0] == self.between[1]:
+            raise ValueError(f"between {list(self.between)}: expected two different bodies")
+        if (self.type == "revolute") != (self.axis is not None):
+            expected = "one, a direction" if self.axis is None else "none"
+            raise ValueError(f"axis of a {self.type} joint: expected {expected}")
+        return self
+
+
 class InlineSkeleton(_Frozen):
     """Bodies given in the model file itself.
 
     Attributes:
         bodies: Rigid bodies, parents before children; required if there is no `file`.
+        loops: Joints that close chains of bodies, such as that between wishbone and upright.
     """
 
     bodies: Annotated[tuple[BodySpec, ...], Field(min_length=1, max_length=256)]
+    loops: Annotated[tuple[LoopSpec, ...], Field(max_length=64)] = ()
 
 
 def _file_in_its_folder(file: str) -> str:
@@ -136,9 +165,12 @@ class FileSkeleton(_Frozen):
     Attributes:
         file: Path of a URDF, SDF, SKEL or MJCF file in the model file's folder; required if there
             are no `bodies`.
+        loops: Joints that close chains of bodies, in addition to those that an MJCF or SDF file
+            states itself.
     """
 
     file: InFolder
+    loops: Annotated[tuple[LoopSpec, ...], Field(max_length=64)] = ()
 
 
 def _skeleton_kind(skeleton: object) -> str:
@@ -236,6 +268,9 @@ class StrutSpec(_Frozen):
         damping_n_s_per_m: Linear damping.
         attachments_m: Attachment points at the lower and at the upper body, each in its body's
             frame.
+        carries: Body whose mass the strut's motion depends on: a diagnosis corrects it, and effects
+            that add mass load it. By default the upper body, or the lower one if the upper one is
+            `world`; of a strut on a suspension arm rather the upright or wheel.
         effects: Effects in addition to the linear spring and damper.
         fmu: A functional mock-up unit (FMU) that computes an additional force in the strut, or
             (with `acceleration`) replaces the whole guided bench. A minus before the name of a
@@ -248,6 +283,7 @@ class StrutSpec(_Frozen):
     stiffness_n_per_m: NotNegative
     damping_n_s_per_m: NotNegative
     attachments_m: tuple[Vector, Vector] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    carries: Name | None = None
     effects: tuple[EffectSpec, ...] = ()
     fmu: FmuSpec | None = None
 
@@ -256,6 +292,12 @@ class StrutSpec(_Frozen):
         if self.between[0] == self.between[1]:
             raise ValueError(f"between {list(self.between)}: expected two different bodies")
         return self
+
+    @property
+    def carried(self) -> str:
+        """The body that it carries."""
+        lower, upper = self.between
+        return self.carries or (upper if upper != WORLD else lower)
 
 
 class ForceInput(_Frozen):
@@ -403,25 +445,26 @@ class ModelSpec(_Frozen):
                     f"{expected_name(body.joint.parent, known)} (parents stand before children)"
                 )
             known.append(body.name)
-        for strut in self.struts:
-            for end in strut.between:
-                if end not in known:
-                    raise ValueError(
-                        f"strut {strut.name}: between {end!r}: {expected_name(end, known)}"
-                    )
+        for where, name, choices in self._names_of_bodies(skeleton, known):
+            if name not in choices:
+                raise ValueError(f"{where} {name!r}: {expected_name(name, choices)}")
+
+    def _names_of_bodies(
+        self, skeleton: InlineSkeleton, known: list[str]
+    ) -> Iterator[tuple[str, str, list[str]]]:
+        """Where a body or joint is named, its name, and the names that there are."""
         bodies = known[1:]
-        body_name = self.applied_force_body
-        if body_name is not None and body_name not in bodies:
-            raise ValueError(
-                f"applied_force_body {body_name!r}: {expected_name(body_name, bodies)}"
-            )
+        for strut in self.struts:
+            yield from ((f"strut {strut.name}: between", end, known) for end in strut.between)
+            yield f"strut {strut.name}: carries", strut.carried, bodies
+        for k, loop in enumerate(skeleton.loops):
+            yield from ((f"loops.{k}: between", end, known) for end in loop.between)
+        if self.applied_force_body is not None:
+            yield "applied_force_body", self.applied_force_body, bodies
         for name, item in (self.inputs or {}).items():
             ((key, acts_on),) = item.model_dump(include=set(_INPUT_KINDS)).items()
             choices = [f"{body}_joint" for body in bodies] if key == "torque_on" else bodies
-            if acts_on not in choices:
-                raise ValueError(
-                    f"inputs.{name}: {key} {acts_on!r}: {expected_name(acts_on, choices)}"
-                )
+            yield f"inputs.{name}: {key}", acts_on, choices
 
     @property
     def drive(self) -> Mapping[str, ForceInput | TorqueInput | MotionInput]:

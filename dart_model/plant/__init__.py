@@ -3,6 +3,8 @@
     skeleton      bodies and joints in DART
     inputs        what drives the model: forces, torques, moved bodies
     motion_between  the motion of a moved body between two times
+    loops         joints that close chains of bodies
+    coordinates   how the joints' coordinates change
     geometry      heights and Jacobians of the struts
     strut         spring, damper and effects as one force
     fmu           a force that a functional mock-up unit computes
@@ -25,10 +27,11 @@ from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType
 
 from dart_model.effects import AMBIENT_C
 from dart_model.errors import ModelError
-from dart_model.plant.backend import ManyCoordinates, OneCoordinate
+from dart_model.plant.backend import LoopedCoordinates, ManyCoordinates, OneCoordinate
+from dart_model.plant.coordinates import sample_positions
 from dart_model.plant.equations_of_motion import EquationsOfMotion
 from dart_model.plant.fmu import MockUp
-from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
+from dart_model.plant.geometry import Array, Geometry, Jacobians
 from dart_model.plant.integrator import (
     LONGEST_STEP_S,
     SHORTEST_STEP_S,
@@ -36,6 +39,7 @@ from dart_model.plant.integrator import (
     exact_step_s,
     stable_step_s,
 )
+from dart_model.plant.loops import Loops
 from dart_model.plant.prescribed_strut import PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
@@ -51,6 +55,8 @@ _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1
 share of the largest stiffness below which a direction counts as free."""
 _FARTHEST = 1.0
 """Distance of a rest (m or rad) beyond which nothing holds the bench: no strut is as long."""
+_HALVINGS = 6
+"""How often a configuration is brought nearer to zero to close its loops there."""
 _DIFFERENCE = 1e-6
 """Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
 third of the digits of a double, where rounding and truncation are about equal."""
@@ -80,7 +86,11 @@ class DartPlant:
             one = OneCoordinate(self._skeleton)
             self._equations = EquationsOfMotion[float](one, self._struts, self._geometry)
         else:
-            many = ManyCoordinates(self._skeleton)
+            loops = self._skeleton.loops
+            if loops is None:
+                many = ManyCoordinates(self._skeleton)
+            else:
+                many = LoopedCoordinates(self._skeleton, loops)
             self._equations = EquationsOfMotion[Array](many, self._struts, self._geometry)
         self._slopes_vary = self._geometry.constant is not None and not all(
             strut.is_linear for strut in self._struts
@@ -100,8 +110,11 @@ class DartPlant:
 
     @property
     def free(self) -> NDArray[np.intp]:
-        """Indices of the coordinates that are free to move: of all that are not given."""
-        return self._skeleton.inputs.free
+        """Indices of the coordinates that are free to move.
+
+        They are all that are not given, and that do not follow from others because of a loop.
+        """
+        return self._skeleton.free
 
     @property
     def free_coordinates(self) -> int:
@@ -147,15 +160,54 @@ class DartPlant:
         q, v = np.zeros(self.coordinates), np.zeros(self.coordinates)
         if inputs is not None:
             self.put_moved(q, v, np.asarray(inputs, np.float64))
-        q = self._geometry.reaching(np.asarray(heights_m, np.float64), q)
-        given = np.isfinite(heights_m)
-        if not given.all():
-            q = self._resting(q, np.asarray(heights_m, np.float64))
-        if velocities_m_per_s is not None:
-            struts, free = self._geometry.at(q).struts[given], self.free
-            own = np.asarray(velocities_m_per_s)[given] - struts @ v
-            v[free] = np.linalg.lstsq(struts[:, free], own, rcond=None)[0]
+        heights = np.asarray(heights_m, np.float64)
+        q = self._geometry.reaching(heights, self._reach(q))
+        if not np.isfinite(heights).all():
+            q = self._resting(q, heights)
+        if velocities_m_per_s is None:
+            v = self._spread(q) @ v
+        else:
+            v = self._rates_with(q, v, np.asarray(velocities_m_per_s, np.float64), heights)
         return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
+
+    def following(
+        self, q: Array, heights_m: Array, velocities_m_per_s: Array, inputs: Array
+    ) -> tuple[Array, Array]:
+        """Coordinates near `q` and their rates, each (n,), with given heights and velocities.
+
+        Heights and velocities have the shape (struts,), as those of `init`; moved bodies are where
+        the inputs have them.
+
+        Raises:
+            ModelError: The joints cannot reach the heights.
+        """
+        q, v = q.copy(), np.zeros_like(q)
+        self.put_moved(q, v, inputs)
+        q = self._geometry.reaching(heights_m, self._closed(q))
+        return q, self._rates_with(q, v, velocities_m_per_s, heights_m)
+
+    def _rates_with(self, q: Array, v: Array, velocities_m_per_s: Array, heights_m: Array) -> Array:
+        """Rates (n,) with the velocities of the struts whose heights are given, moved as in `v`."""
+        given, spread, free = np.isfinite(heights_m), self._spread(q), self.free
+        rows = (self._geometry.at(q).struts @ spread)[given]
+        v = v.copy()
+        v[free] = 0.0
+        own = velocities_m_per_s[given] - rows @ v
+        v[free] = np.linalg.lstsq(rows[:, free], own, rcond=None)[0]
+        return spread @ v
+
+    def _spread(self, q: Array) -> Array:
+        """Rates of all coordinates per rate of each that is free or moved, shape (n, n)."""
+        loops = self._skeleton.loops
+        return np.eye(self.coordinates) if loops is None else loops.spread(q)
+
+    def _closed(self, q: Array) -> Array:
+        """The free and moved coordinates of `q`, with the others so that the loops are closed."""
+        return q if self._skeleton.loops is None else self._skeleton.loops.close(q)
+
+    def _reach(self, q: Array) -> Array:
+        """The same, whatever the others are in `q`."""
+        return q if self._skeleton.loops is None else self._skeleton.loops.reach(q)
 
     def put_moved(self, q: Array, v: Array, inputs: Array) -> None:
         """Write positions and velocities of moved bodies into coordinates and rates, each (n,)."""
@@ -167,8 +219,9 @@ class DartPlant:
 
         Where there is no such rest within a metre, these directions stay as they are.
         """
-        start, own = q, np.eye(self.coordinates)[:, self.free]
+        start = q
         for _ in range(_RESTING_STEPS):
+            own = self._spread(q)[:, self.free]
             given = self._geometry.at(q).struts[np.isfinite(heights_m)]
             free: Array = null_space(given @ own)
             if not free.size:
@@ -176,15 +229,15 @@ class DartPlant:
             force = free.T @ self._force_at_rest(q)
             free_in_all: Array = own @ free
             slopes = [
-                self._force_at_rest(q + _RESTING_STEP * direction)
-                - self._force_at_rest(q - _RESTING_STEP * direction)
+                self._force_at_rest(self._closed(q + _RESTING_STEP * direction))
+                - self._force_at_rest(self._closed(q - _RESTING_STEP * direction))
                 for direction in free_in_all.T
             ]
             stiffness = -free.T @ np.column_stack(slopes) / (2.0 * _RESTING_STEP)
             # No spring holds some directions: they stay where they are.
             move = np.linalg.lstsq(stiffness, force, rcond=_SPRINGLESS)[0]
             move *= min(1.0, _LONGEST_MOVE / max(float(np.abs(move).max()), 1e-300))
-            q = self._geometry.reaching(heights_m, q + free_in_all @ move)
+            q = self._geometry.reaching(heights_m, self._closed(q + free_in_all @ move))
             if np.abs(move).max() < _RESTED:
                 return q if np.abs(q - start).max() < _FARTHEST else start
         return start
@@ -215,11 +268,21 @@ class DartPlant:
         velocities = [state.velocities[k] for k in free]
         return (*positions, *velocities, *state.internal)
 
-    def state_of(self, numbers: Sequence[float], t_s: float = 0.0) -> PlantState:
-        """The state of numbers as `numbers` returns them; what is moved is at zero."""
+    def state_of(
+        self, numbers: Sequence[float], t_s: float = 0.0, inputs: Sequence[float] | None = None
+    ) -> PlantState:
+        """The state of numbers as `numbers` returns them; what is moved is at zero without inputs.
+
+        Raises:
+            ModelError: No loop can be closed there.
+        """
         n = self.free_coordinates
         q, v = np.zeros((2, self.coordinates))
         q[self.free], v[self.free] = numbers[:n], numbers[n : 2 * n]
+        if inputs is not None:
+            self.put_moved(q, v, np.asarray(inputs, np.float64))
+        q = self._reach(q)
+        v = self._spread(q) @ v
         return self.state(q.tolist(), v.tolist(), tuple(numbers[2 * n :]), t_s)
 
     def load(
@@ -295,7 +358,35 @@ class DartPlant:
             columns = columns - every[free][:, moved.coordinates] @ here.inputs[moved.coordinates]
             by_motion = here.struts[:, moved.coordinates] * moved.signs
         struts = np.ascontiguousarray(here.struts[:, free])
-        return Mechanics(here.heights_m(q), struts, columns, by_motion, mass, bias)
+        mechanics = Mechanics(here.heights_m(q), struts, columns, by_motion, mass, bias)
+        loops = self._skeleton.loops
+        return mechanics if loops is None else self._with_loops(mechanics, loops, q, here)
+
+    def _with_loops(self, tree: Mechanics, loops: Loops, q: Array, here: Jacobians) -> Mechanics:
+        """The equations of motion on the free coordinates, from those of the tree.
+
+        With ``v = spread @ w`` of free and moved coordinates w, the accelerations are
+        ``spread @ w' + curved``, and what the loops carry does no work on w.
+        """
+        movable, moved = self._skeleton.inputs.free, self._skeleton.inputs.moved
+        curved = np.zeros(self.coordinates)
+        own = loops.jacobian(q)[:, loops.dependent]
+        curved[loops.dependent] = -np.linalg.solve(own, loops.curvature())
+        spread = loops.spread(q)
+        basis, mass = spread[np.ix_(movable, loops.free)], tree.mass
+        inputs, by_motion = tree.inputs, tree.moved
+        if moved is not None:
+            with_motion = spread[np.ix_(movable, moved.coordinates)]
+            inputs = inputs - mass @ with_motion @ here.inputs[moved.coordinates]
+            by_motion = by_motion + (tree.struts @ with_motion) * moved.signs
+        return Mechanics(
+            tree.heights_m,
+            tree.struts @ basis,
+            basis.T @ inputs,
+            by_motion,
+            basis.T @ mass @ basis,
+            basis.T @ (tree.bias - mass @ curved[movable]),
+        )
 
     def bias_slopes(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Derivatives of the bias force by coordinates (n,) and by their rates (n,).
@@ -313,10 +404,15 @@ class DartPlant:
 
     def _bias_slopes(self, q: Array, v: Array, directions: Array) -> tuple[Array, Array]:
         steps = _DIFFERENCE * directions
-        by_q = [self.mechanics(q + h, v).bias - self.mechanics(q - h, v).bias for h in steps]
-        by_v = [self.mechanics(q, v + h).bias - self.mechanics(q, v - h).bias for h in steps]
+        by_q = [self._bias_at(q + h, v) - self._bias_at(q - h, v) for h in steps]
+        by_v = [self._bias_at(q, v + h) - self._bias_at(q, v - h) for h in steps]
         scale = 2.0 * _DIFFERENCE
         return np.column_stack(by_q) / scale, np.column_stack(by_v) / scale
+
+    def _bias_at(self, q: Array, v: Array) -> Array:
+        """Bias force with the free and moved coordinates and rates of `q` and `v`."""
+        q = self._closed(q)
+        return self.mechanics(q, v if self._skeleton.loops is None else self._spread(q) @ v).bias
 
     @property
     def is_constant(self) -> bool:
@@ -335,7 +431,7 @@ class DartPlant:
     def _longest_step_s(self) -> float:
         linear = [(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in self.spec.struts]
         rest = np.zeros(self.coordinates)
-        samples = sample_positions(self.coordinates)
+        samples = self._sample_places()
         benches = [(self.mechanics(q, rest), *self.bias_slopes(q, rest)) for q in samples]
         exact_s = min(exact_step_s(_linearise(*bench, linear)) for bench in benches)
         if exact_s < SHORTEST_STEP_S:
@@ -348,6 +444,24 @@ class DartPlant:
         steepest = [strut.steepest() for strut in self._struts]
         stable_s = min(stable_step_s(_linearise(*bench, steepest)) for bench in benches)
         return min(LONGEST_STEP_S, exact_s, max(stable_s, SHORTEST_STEP_S))
+
+    def _sample_places(self) -> list[Array]:
+        """Generic configurations; with loops those on the way there that they can be closed in."""
+        samples = sample_positions(self.coordinates)
+        if self._skeleton.loops is None:
+            return samples
+        return [np.zeros(self.coordinates), *map(self._nearest_closed, samples)]
+
+    def _nearest_closed(self, q: Array) -> Array:
+        for _ in range(_HALVINGS):
+            try:
+                closed = self._reach(q)
+                self._spread(closed)
+            except ModelError:
+                q = 0.5 * q
+            else:
+                return closed
+        return np.zeros_like(q)
 
 
 def _linearise(

@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.plant.geometry import coordinates_add_up, move
+from dart_model.plant.loops import Loops
 from dart_model.plant.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Backend(Protocol[Value]):
         """Product of a row of a Jacobian and a value."""
         ...
 
-    def move(self, q: Value, v: Value, h: float) -> Value:
+    def move(self, q: Value, v: Value, h: float, /) -> Value:
         """Coordinates after `h` seconds at given rates."""
         ...
 
@@ -67,6 +67,10 @@ class Backend(Protocol[Value]):
 
     def applied_force_n(self, inputs: Value, /) -> float:
         """Applied force of the laws that depend on one: the first force of the inputs."""
+        ...
+
+    def closed(self, q: Value, v: Value) -> tuple[Value, Value]:
+        """Coordinates and rates without what a step has left open of loops."""
         ...
 
 
@@ -101,6 +105,9 @@ class OneCoordinate:
 
     def columns(self, columns: Array) -> float:
         return float(columns[0, 0])
+
+    def closed(self, q: float, v: float) -> tuple[float, float]:
+        return q, v
 
     def motions_between(self, begin: float, end: float, duration_s: float) -> None:
         """None: its only coordinate is free."""
@@ -141,7 +148,6 @@ class ManyCoordinates:
     """The coordinates of a skeleton, as an array."""
 
     def __init__(self, skeleton: Skeleton) -> None:
-        self._skeleton = skeleton
         # DART's functions for arrays cost as much as six or more of those for one number.
         coordinates = [skeleton.dart.getDof(k) for k in range(skeleton.coordinates)]
         free = skeleton.inputs.free.tolist()
@@ -153,7 +159,7 @@ class ManyCoordinates:
         self._first_force = skeleton.inputs.first_force
         self._get: list[Callable[[], float]] = [item.getAcceleration for item in coordinates]
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
-        self._adds_up = coordinates_add_up(skeleton)
+        self.move = skeleton.move
 
     def value(self, numbers: Sequence[float], /) -> Array:
         return np.array(numbers, dtype=np.float64)
@@ -184,8 +190,8 @@ class ManyCoordinates:
     def applied_force_n(self, inputs: Array) -> float:
         return 0.0 if self._first_force is None else float(inputs[self._first_force])
 
-    def move(self, q: Array, v: Array, h: float) -> Array:
-        return q + h * v if self._adds_up else move(self._skeleton, q, v, h)
+    def closed(self, q: Array, v: Array) -> tuple[Array, Array]:
+        return q, v
 
     def acceleration(self, q: Array, v: Array, force: Array) -> Array:
         numbers = zip(q.tolist(), v.tolist(), force.tolist(), strict=True)
@@ -194,3 +200,21 @@ class ManyCoordinates:
                 put(number)
         self._solve()
         return np.array([get() for get in self._get])
+
+
+class LoopedCoordinates(ManyCoordinates):
+    """The coordinates of a skeleton whose joints close loops.
+
+    DART accelerates the tree, and the multipliers of the loops' constraints add what they hold.
+    """
+
+    def __init__(self, skeleton: Skeleton, loops: Loops) -> None:
+        super().__init__(skeleton)
+        self._loops = loops
+
+    def closed(self, q: Array, v: Array) -> tuple[Array, Array]:
+        return self._loops.project(q, v)
+
+    def acceleration(self, q: Array, v: Array, force: Array) -> Array:
+        free = super().acceleration(q, v, force)
+        return free + self._loops.multipliers(q)[1]

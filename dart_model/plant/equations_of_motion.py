@@ -146,6 +146,7 @@ class EquationsOfMotion(Generic[Value]):
         )
         if is_moved:
             put_moved(q, v, end)
+        q, v = backend.closed(q, v)
         return self._state(q, v, internal, state.t_s + dt_s)
 
     def _state(self, q: Value, v: Value, internal: Internal, t_s: float) -> PlantState:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.errors import ModelError
+from dart_model.plant.coordinates import sample_positions
 from dart_model.plant.skeleton import Skeleton
 from dart_model.spec import WORLD, ModelSpec, StrutSpec
 
@@ -16,6 +17,8 @@ _NEWTON_STEPS = 50
 """Newton's method doubles its digits at each step, once it is near: more steps change nothing."""
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
+_LONGEST_MOVE = 0.1
+"""Longest move (m or rad) of the free coordinates at once where loops have to be closed behind."""
 _DISAGREEMENT_M = 5e-4
 """Disagreement of the sensors of more struts than coordinates that noise explains."""
 _SHORTEST_M = 1e-12
@@ -110,8 +113,8 @@ class Geometry:
         self.is_free = np.zeros(skeleton.coordinates)
         """1 for a coordinate that is free to move, 0 for one that is moved, shape (n,)."""
         self.is_free[skeleton.inputs.free] = 1.0
-        self.constant = self._same_everywhere()
-        """The Jacobians, if they are the same in every configuration."""
+        self.constant = self._same_everywhere() if skeleton.loops is None else None
+        """The Jacobians, if they are the same in every configuration and no loop is closed."""
 
     def at(self, q: Array) -> Jacobians:
         """Jacobians at coordinates `q`, shape (n,)."""
@@ -186,7 +189,7 @@ class Geometry:
         """Coordinates with given strut heights, by Newton's method; moved ones stay where they are.
 
         Heights of more struts than coordinates are those of sensors that disagree by their noise:
-        the coordinates are the nearest, in the least squares.
+        the coordinates are the nearest, in the least squares. Loops are closed.
 
         Args:
             heights_m: One height a strut, shape (struts,); NaN where none is given.
@@ -196,15 +199,21 @@ class Geometry:
             ModelError: The joints cannot reach the heights.
         """
         q, given = near, np.isfinite(heights_m)
-        free = self._skeleton.inputs.free
+        free, loops = self._skeleton.free, self._skeleton.loops
         for _ in range(_NEWTON_STEPS):
             here = self.at(q)
             error = (heights_m - here.heights_m(q))[given]
             if float(np.max(np.abs(error), initial=0.0)) < _REACHED_M:
                 break
-            step = np.linalg.lstsq(here.struts[given][:, free], error, rcond=None)[0]
+            struts = here.struts if loops is None else here.struts @ loops.spread(q)
+            step = np.linalg.lstsq(struts[given][:, free], error, rcond=None)[0]
             q = q.copy()
-            q[free] += step
+            if loops is None:
+                q[free] += step
+            else:
+                step *= min(1.0, _LONGEST_MOVE / max(float(np.abs(step).max()), 1e-300))
+                q[free] += step
+                q = loops.close(q)
             if float(np.max(np.abs(step))) < _REACHED_M:
                 break
         allowed_m = _OUT_OF_REACH_M if np.sum(given) <= len(free) else _DISAGREEMENT_M
@@ -223,28 +232,6 @@ class Geometry:
             for a, b in zip(first, other, strict=True)
         )
         return first if same else None
-
-
-def move(skeleton: Skeleton, q: Array, v: Array, h: float) -> Array:
-    """Coordinates after `h` seconds from `q` at rates `v`; rotations in space do not add up."""
-    skeleton.dart.setPositions(q)
-    skeleton.dart.setVelocities(v)
-    skeleton.dart.integratePositions(h)
-    return np.array(skeleton.dart.getPositions())
-
-
-def coordinates_add_up(skeleton: Skeleton) -> bool:
-    """Whether rates `v` lead to ``q + h * v`` in `h` seconds, as for all but rotations in space."""
-    for q in sample_positions(skeleton.coordinates):
-        v = np.roll(q, 1) + 1.0
-        if not np.allclose(move(skeleton, q, v, 0.5), q + 0.5 * v, rtol=0.0, atol=1e-12):
-            return False
-    return True
-
-
-def sample_positions(coordinates: int) -> list[Array]:
-    """Fixed generic configurations at which constancy is tested."""
-    return [0.3 * np.sin(1.0 + (k + 0.7) * np.arange(1, coordinates + 1)) for k in range(4)]
 
 
 def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:

@@ -10,13 +10,17 @@ from typing import Any, NamedTuple, cast
 
 import dartpy
 import numpy as np
+from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from dart_model.errors import ModelError
+from dart_model.plant.coordinates import Move, move_of
 from dart_model.plant.dart_types import DartBody, DartSkeleton
 from dart_model.plant.inputs import Inputs
+from dart_model.plant.loops import Loops
 from dart_model.skeleton_checks import refuse_fatal
 from dart_model.skeleton_file import MJCF_SUFFIXES, refuse_endless
+from dart_model.skeleton_loops import loops_of_file
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
 # dartpy ships no types.
@@ -27,11 +31,21 @@ _INSTANT_S = 1e-9
 
 
 class Skeleton(NamedTuple):
-    """Bodies and joints in DART, and what drives them."""
+    """Bodies and joints in DART, and what drives them.
+
+    Attributes:
+        loops: Joints that close chains of bodies; None where there are none.
+        move: How the coordinates change at given rates.
+        free: Indices of the coordinates that are free to move: of all that no input moves, those
+            that no loop makes depend on others.
+    """
 
     dart: DartSkeleton
     bodies: dict[str, DartBody]
     inputs: Inputs
+    loops: Loops | None
+    move: Move
+    free: NDArray[np.intp]
 
     @property
     def coordinates(self) -> int:
@@ -52,19 +66,30 @@ def build(spec: ModelSpec) -> Skeleton:
         dart = _inline_skeleton(spec.name, spec.skeleton)
     bodies = {body.getName(): body for body in dart.getBodyNodes()}
     for strut in spec.struts:
+        where = f"model {spec.name}: strut {strut.name}"
         for end in strut.between:
             if end != WORLD and end not in bodies:
                 raise ModelError(
-                    f"model {spec.name}: strut {strut.name}: between {end!r}: expected one of "
-                    f"{', '.join([WORLD, *bodies])}"
+                    f"{where}: between {end!r}: expected one of {', '.join([WORLD, *bodies])}"
                 )
+        if strut.carried not in bodies:
+            raise ModelError(
+                f"{where}: carries {strut.carried!r}: expected one of {', '.join(bodies)}"
+            )
     if dart.getNumDofs() == 0:
         raise ModelError(f"model {spec.name}: skeleton has no joint that moves, expected one")
     dart.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
     dart.setTimeStep(_INSTANT_S)
     _add_masses(spec, bodies)
     _refuse_singular_mass(spec, dart)
-    return Skeleton(dart, bodies, Inputs(spec, dart))
+    inputs, move = Inputs(spec, dart), move_of(dart)
+    loops, closing = None, spec.skeleton.loops
+    if isinstance(spec.skeleton, FileSkeleton):
+        closing = loops_of_file(spec.folder / spec.skeleton.file) + closing
+    if closing:
+        loops = Loops(spec.name, closing, dart, inputs.free, move)
+    free = inputs.free if loops is None else loops.free
+    return Skeleton(dart, bodies, inputs, loops, move, free)
 
 
 def _add_masses(spec: ModelSpec, bodies: dict[str, DartBody]) -> None:
@@ -73,14 +98,13 @@ def _add_masses(spec: ModelSpec, bodies: dict[str, DartBody]) -> None:
         for item in strut.effects:
             if not effect(item.name).adds_mass:
                 continue
-            end = strut.between[1] if strut.between[1] != WORLD else strut.between[0]
-            mass = bodies[end].getMass() + item.values()[0]
+            mass = bodies[strut.carried].getMass() + item.values()[0]
             if mass <= 0.0:
                 raise ModelError(
-                    f"model {spec.name}: strut {strut.name}: effect {item.name} leaves {end} "
-                    f"a mass of {mass} kg, expected more than zero"
+                    f"model {spec.name}: strut {strut.name}: effect {item.name} leaves "
+                    f"{strut.carried} a mass of {mass} kg, expected more than zero"
                 )
-            bodies[end].setMass(mass)
+            bodies[strut.carried].setMass(mass)
 
 
 def _refuse_singular_mass(spec: ModelSpec, dart: DartSkeleton) -> None:
@@ -195,12 +219,22 @@ def _first_skeleton(world: Any) -> DartSkeleton | None:
     return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
 
 
+def _joined_skeletons(world: Any) -> DartSkeleton | None:
+    """All of an MJCF file, of whose bodies on the world DART makes a skeleton each."""
+    first = cast("Any", _first_skeleton(world))
+    for k in range(1, 0 if first is None else world.getNumSkeletons()):
+        other = world.getSkeleton(k)
+        while other.getNumBodyNodes():
+            other.getBodyNode(0).moveTo(first, None)
+    return first
+
+
 _PARSERS: dict[str, Callable[[str], DartSkeleton | None]] = {
     ".urdf": _read_urdf,
     ".sdf": _dart.utils.SdfParser.readSkeleton,
     ".skel": lambda uri: _first_skeleton(_dart.utils.SkelParser.readWorld(uri)),
     **dict.fromkeys(
-        MJCF_SUFFIXES, lambda uri: _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
+        MJCF_SUFFIXES, lambda uri: _joined_skeletons(_dart.utils.MjcfParser.readWorld(uri))
     ),
 }
 """DART's parser for each suffix."""

@@ -1,8 +1,8 @@
 """Any variable of a model in a state: motions of points and bodies, and what joints carry.
 
 A joint carries what its subtree needs beside the forces that act on that: the inertia of the
-bodies in it, less their weight, less struts and inputs that act on them from outside. Struts act
-along their lines on both ends, whatever directions the joints leave free.
+bodies in it, less their weight, less struts, inputs and joints of loops that act on them from
+outside. Struts act along their lines on both ends, whatever directions the joints leave free.
 
 Where all of that is affine in coordinates, rates, accelerations, strut forces and inputs, as of
 bodies on straight guides, it is one matrix.
@@ -42,12 +42,15 @@ class _Instant(NamedTuple):
         inputs: Input vector.
         directions: Along which struts push, shape (struts, 3); empty where no joint is read.
         ends: Lower and upper ends of the struts in m, shape (2, struts, 3); likewise.
+        wrenches: Force (N) and torque (N·m) that each loop's joint exerts on its second body at its
+            point, in the world's directions, shape (loops, 2, 3); likewise.
     """
 
     forces_n: Array
     inputs: Array
     directions: Array
     ends: Array
+    wrenches: Array
 
 
 _Reader = Callable[[_Instant], float]
@@ -130,12 +133,32 @@ class VirtualSensors:
 
     def _read(self, q: Array, v: Array, a: Array, forces_n: Array, inputs: Array) -> list[float]:
         dart = self._dart
+        directions, ends, wrenches = q[:0], q[:0], q[:0]
+        if self._reads_joints:
+            directions, ends = self._geometry.lines(q)
+            wrenches = self._loop_wrenches(q, v, forces_n, inputs)
         dart.setPositions(q)
         dart.setVelocities(v)
         dart.setAccelerations(a)
-        directions, ends = self._geometry.lines(q) if self._reads_joints else (q[:0], q[:0])
-        now = _Instant(forces_n, inputs, directions, ends)
+        now = _Instant(forces_n, inputs, directions, ends, wrenches)
         return [reader(now) for reader in self._readers]
+
+    def _loop_wrenches(self, q: Array, v: Array, forces_n: Array, inputs: Array) -> Array:
+        """What the joints of loops exert on their second bodies, shape (loops, 2, 3)."""
+        loops = self._skeleton.loops
+        if loops is None:
+            return np.zeros((0, 2, 3))
+        here = self._geometry.at(q)
+        force = here.inputs @ inputs + (forces_n @ here.struts) * self._geometry.is_free
+        self._dart.setPositions(q)
+        self._dart.setVelocities(v)
+        # Of a moved coordinate it is the acceleration, a command to DART. A command to any other
+        # coordinate would be its force, so that the forces come last.
+        self._dart.setCommands(force)
+        self._dart.setForces(force)
+        self._dart.computeForwardDynamics()
+        multipliers, _ = loops.multipliers(q)
+        return loops.wrenches(multipliers)
 
     def _find_affine(self) -> Array | None:
         """Matrix of all numbers, of more force in parallel with the struts, and of one.
@@ -248,6 +271,7 @@ class VirtualSensors:
         bodies = self._subtree(joint)
         inputs = self._inputs_on(bodies)
         signs = self._strut_signs(bodies)
+        loops = self._loops_on(bodies)
 
         def reaction(now: _Instant) -> float:
             total = 0.0
@@ -257,6 +281,8 @@ class VirtualSensors:
             total -= float((signs.sum(axis=0) * now.forces_n) @ (now.directions @ axis))
             for column, _, _, direction in inputs:
                 total -= float(now.inputs[column]) * float(axis @ direction)
+            for k, sign, _ in loops:
+                total -= sign * float(axis @ now.wrenches[k, 0])
             return total
 
         return reaction
@@ -265,6 +291,7 @@ class VirtualSensors:
         bodies = self._subtree(joint)
         inputs = self._inputs_on(bodies)
         signs = self._strut_signs(bodies)
+        loops = self._loops_on(bodies)
         child = joint.getChildBodyNode()
 
         def torque(now: _Instant) -> float:
@@ -281,6 +308,9 @@ class VirtualSensors:
             for column, body, at, direction in inputs:
                 point = (body.getWorldTransform().matrix() @ np.append(at, 1.0))[:3]
                 total -= np.cross(point - pivot, float(now.inputs[column]) * direction)
+            for k, sign, place in loops:
+                force_n, torque = sign * now.wrenches[k]
+                total -= np.cross(place() - pivot, force_n) + torque
             return float(axis @ total)
 
         return torque
@@ -300,6 +330,16 @@ class VirtualSensors:
         """Column, body, point and direction of the force inputs that act on some bodies."""
         names = {body.getName() for body in bodies}
         return [item for item in self._skeleton.inputs.forces if item[1].getName() in names]
+
+    def _loops_on(self, bodies: Sequence[Any]) -> list[tuple[int, float, Callable[[], Array]]]:
+        """Index, sign and place (m) of the joints of loops that act on some bodies from outside."""
+        loops, names = self._skeleton.loops, {body.getName() for body in bodies}
+        found: list[tuple[int, float, Callable[[], Array]]] = []
+        for k, (spec, place) in enumerate(() if loops is None else loops.places()):
+            first, second = (name in names for name in spec.between)
+            if first != second:
+                found.append((k, 1.0 if second else -1.0, place))
+        return found
 
     def _strut_signs(self, bodies: Sequence[Any]) -> Array:
         """How a strut's force acts on some bodies by its lower and upper end, (2, struts)."""

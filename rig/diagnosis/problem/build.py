@@ -95,7 +95,7 @@ def build(
     first = smooth[0]
     drive = drive_of_recording(spec, first.recording)
     mechanism = mechanism_along(plants, first.motion, drive.at(first.grid.t_s))
-    masses = [linear_part.moving_mass_kg(mechanism, i) for i in range(len(motions))]
+    masses = [linear_part.moving_mass_kg(spec, mechanism, i) for i in range(len(motions))]
     motions = tuple(m._replace(mass_kg=mass) for m, mass in zip(motions, masses, strict=True))
     linear = linear_part.linear_parameters(spec, kind.bench, motions, mechanism, drive)
     linear += delay_parameters(spec, first.recording)

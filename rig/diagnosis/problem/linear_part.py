@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import Bench, Motion, effect
-from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
+from dart_model.spec import EffectSpec, InlineSkeleton, ModelSpec
 from rig.diagnosis.problem.drive import Drive
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 from rig.diagnosis.problem.problem import Kind, LinearParameter, mid_stroke_m
+from rig.recordings.recording import RecordingError
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def linear_parameters(
     Where no force drives the bench, the data determine masses, stiffnesses, dampings and forces of
     laws up to a common factor: the largest moving mass is then not corrected, and sets the scale.
     """
-    masses = [moving_mass_kg(mechanism, i) for i in range(len(motions))]
+    masses = [moving_mass_kg(spec, mechanism, i) for i in range(len(motions))]
     scale_strut = -1 if drive.has_force else int(np.argmax(masses))
     parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
@@ -107,13 +108,22 @@ def _deviation(spec: ModelSpec, kind: Kind, scale: float) -> float:
     return (TOLERANCES[kind] if stated is None else float(stated)) * scale
 
 
-def moving_mass_kg(mechanism: LinearisedMechanism, strut: int) -> float:
-    """Mass that a strut's force moves directly: its upper body with all that it carries."""
+def moving_mass_kg(spec: ModelSpec, mechanism: LinearisedMechanism, strut: int) -> float:
+    """Mass that a strut's force moves directly: the body that it carries, with all on that.
+
+    Raises:
+        RecordingError: No motion depends on that body's mass.
+    """
     per_kg = mechanism.mass_by_kg[:, strut].mean(axis=0)
     mass = mechanism.mass.mean(axis=0)
     # Of the coordinates that a kg on this body loads, the one that moves the least other mass:
     # further ones move it together with the bodies below.
     loaded = np.diag(per_kg) > 0.0
+    if not loaded.any():
+        raise RecordingError(
+            f"strut {spec.struts[strut].name}: the mass of {spec.struts[strut].carried} makes no "
+            "difference to its motion, expected `carries` to name a body whose mass does"
+        )
     return float(np.min(np.diag(mass)[loaded] / np.diag(per_kg)[loaded]))
 
 
@@ -209,17 +219,17 @@ def _with_sum(spec: ModelSpec, strut: str, name: str, change: float) -> ModelSpe
 
 def _with_mass(spec: ModelSpec, strut: str, change: float) -> ModelSpec:
     """The model with more mass on the body that `added_mass` would load."""
-    between = spec.strut(strut).between
-    end = between[1] if between[1] != WORLD else between[0]
+    carried = spec.strut(strut).carried
     if not isinstance(spec.skeleton, InlineSkeleton):
         return _with_sum(spec, strut, "added_mass", change)
     bodies = tuple(
         body.model_copy(update={"mass_kg": round_for_file(body.mass_kg + change)})
-        if body.name == end and body.mass_kg + change > 0.0
+        if body.name == carried and body.mass_kg + change > 0.0
         else body
         for body in spec.skeleton.bodies
     )
-    return spec.model_copy(update={"skeleton": InlineSkeleton(bodies=bodies)})
+    skeleton = spec.skeleton.model_copy(update={"bodies": bodies})
+    return spec.model_copy(update={"skeleton": skeleton})
 
 
 def round_for_file(value: float) -> float:

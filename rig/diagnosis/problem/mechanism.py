@@ -18,8 +18,6 @@ from rig.recordings.recording import RecordingError
 
 Array = NDArray[np.float64]
 
-_REACHED_M = 1e-12
-"""Error of a height at which Newton's method ends: a millionth of any sensor's step."""
 _ONE_KG = EffectSpec(name="added_mass", parameters={"mass_kg": 1.0})
 
 
@@ -206,21 +204,10 @@ def tabulate_mechanism(
     """
     plant = plants.plain
     first = plant.init(heights_m[0].tolist(), inputs=inputs[0].tolist())
-    q, v = np.array(first.positions), np.zeros(plant.coordinates)
-    free = plant.free
+    q = np.array(first.positions)
     entries: list[LinearisedMechanism] = []
     for height, velocity, given in zip(heights_m, velocities_m_per_s, inputs, strict=True):
-        q, v = q.copy(), v.copy()
-        plant.put_moved(q, v, given)
-        for _ in range(20):
-            jacobians = plant.jacobians(q)
-            error = height - jacobians.offsets_m - jacobians.struts @ q
-            q[free] += np.linalg.lstsq(jacobians.struts[:, free], error, rcond=None)[0]
-            if float(np.max(np.abs(error))) < _REACHED_M:
-                break
-        struts = plant.jacobians(q).struts
-        v[free] = 0.0
-        v[free] = np.linalg.lstsq(struts[:, free], velocity - struts @ v, rcond=None)[0]
+        q, v = plant.following(q, height, velocity, given)
         entries.append(_mechanism_at(plants, q, v))
     return _stack(entries)
 

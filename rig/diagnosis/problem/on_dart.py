@@ -104,10 +104,8 @@ def _simulate_heights(
     states, start = begin
     grid = run.grid
     n, inputs = plant.free_coordinates, _interpolate_inputs(run, count, steps)
-    q, v = np.zeros((2, plant.coordinates))
-    q[plant.free], v[plant.free] = start[:n], start[n : 2 * n]
-    plant.put_moved(q, v, inputs[0])
-    state = plant.state(q.tolist(), v.tolist(), states, float(grid.t_s[0]))
+    numbers = (*start[: 2 * n].tolist(), *states)
+    state = plant.state_of(numbers, float(grid.t_s[0]), inputs[0].tolist())
     drive = inputs.tolist()
     no_forces = (0.0,) * len(plant.spec.struts)
     heights = np.empty((count, len(no_forces)))
