@@ -141,7 +141,8 @@ class InlineSkeleton(_Frozen):
 
     Attributes:
         bodies: Rigid bodies, parents before children; required if there is no `file`.
-        loops: Joints that close chains of bodies, such as that between wishbone and upright.
+        loops: Joints that close chains of bodies, such as that between wishbone and upright; those
+            that an MJCF or SDF file states itself are read from there.
     """
 
     bodies: Annotated[tuple[BodySpec, ...], Field(min_length=1, max_length=256)]
@@ -165,8 +166,8 @@ class FileSkeleton(_Frozen):
     Attributes:
         file: Path of a URDF, SDF, SKEL or MJCF file in the model file's folder; required if there
             are no `bodies`.
-        loops: Joints that close chains of bodies, in addition to those that an MJCF or SDF file
-            states itself.
+        loops: Joints that close chains of bodies, such as that between wishbone and upright; those
+            that an MJCF or SDF file states itself are read from there.
     """
 
     file: InFolder

@@ -43,6 +43,7 @@ _NAVIGATION: dict[str, tuple[str, ...]] = {
         "how-to/canopen-j1939",
         "how-to/several-struts",
         "how-to/inputs",
+        "how-to/closed-loops",
         "how-to/several-sensors",
         "how-to/virtual-sensors",
         "how-to/tune",

@@ -14,6 +14,7 @@ round: the fastest rounds of two subjects need not have met the same machine. Th
 `.ci/run` runs these by themselves.
 """
 
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,7 @@ import pytest
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
-from dart_model.spec import MODELS, load_model
+from dart_model.spec import MODELS, load_model, parse_model
 from rig.bridge.bridge import Bridge, BridgeState
 from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import Mode, StepInput
@@ -40,6 +41,7 @@ from rig.plan.config import CONFIGS, VirtualSensorConfig
 from rig.plan.load import load_plan
 from rig.run.replay import replay
 from tests.bridge.cores import FIRST, GAINS, core, measured, resting, run
+from tests.dart_model.mechanisms import double_wishbone
 from tests.run.listed import MS, ListPort, bench_frames, live
 
 TICKS = 300
@@ -324,6 +326,31 @@ def test_a_second_observer_costs_no_more_than_the_first(capsys):
     two = np.median(found["quarter car, observed"] - alone)
     # The difference of two times is noisy; the quarter car's own time bounds what it may be.
     assert two <= 2.0 * max(one, 0.0) + 0.25 * np.median(alone)
+
+
+def steps_of(plant: DartPlant, height_m: float) -> Subject:
+    """Steps of a plant by itself, from rest under the applied force."""
+
+    def run_steps() -> None:
+        state = plant.init([height_m])
+        for force in APPLIED_N:
+            state = plant.step(plant.load(state, (0.0,), (force,), 23.0), 1e-3, (force,))
+
+    return run_steps
+
+
+def test_a_closed_loop_fits_into_a_tick_of_a_millisecond(capsys):
+    """It takes half a millisecond where this is measured, and a body on a guide 15 us."""
+    corner = double_wishbone()
+    looped = DartPlant(parse_model(json.dumps(corner.content), "double wishbone"))
+    found = compare_rounds(
+        {
+            "plant alone": steps_of(DartPlant(load_model(MODELS / "reference.yaml")), 0.4),
+            "double wishbone": steps_of(looped, corner.strut_m(0.0)),
+        },
+        capsys,
+    )
+    assert np.median(found["double wishbone"] / found["plant alone"]) <= 50.0  # measured: 36
 
 
 def test_a_tick_over_a_virtual_bus(capsys):

@@ -3,10 +3,12 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import rig
 from can_dbc.errors import InputError
 from dart_model.errors import ModelError
 from dart_model.plant import DartPlant
@@ -367,3 +369,11 @@ def test_a_loop_of_a_file_that_is_not_supported_is_refused(tmp_path, name, text,
     with pytest.raises(InputError) as refused:
         plant_of_file(tmp_path, name, text)
     assert message in str(refused.value)
+
+
+def test_the_model_of_the_guide_is_one_with_a_single_free_coordinate():
+    page = Path(rig.__file__).parent / "guide/pages/how-to/closed-loops.md"
+    block = page.read_text("utf-8").split("name: corner", 1)[1].split("\n\n", 1)[0]
+    plant = DartPlant(parse_model(f"    name: corner{block}", str(page)))
+    assert plant.free_coordinates == 1
+    assert plant.init([0.56]).struts[0][0] == pytest.approx(0.56)

@@ -9,7 +9,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
 from rig.diagnosis.problem.driven_run import DrivenRun
 from rig.diagnosis.problem.linear_part import round_for_file, spec_with_linear_changes
-from rig.diagnosis.problem.problem import CandidateModel, Problem, slots_of
+from rig.diagnosis.problem.problem import CandidateModel, Problem, rms, slots_of
 
 Array = NDArray[np.float64]
 
@@ -65,17 +65,20 @@ def dart_heights(
     """Heights of a model in free run in DART, shape (N, struts).
 
     Its steps are refined until its heights differ from `expected_m`, those of the same model as the
-    diagnosis simulates it, by less than `tolerance_m` RMS.
+    diagnosis simulates it, or from those with steps of twice the length, by less than `tolerance_m`
+    RMS: where joints turn, a model that does not follow the bench moves otherwise in DART.
     """
     plant = DartPlant(spec_with_corrections(problem, model))
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
     states = _plant_states(problem, model, start[2 * plant.free_coordinates :], plant)
     steps = 2 if run.substeps == 1 else 2 * run.substeps
+    known = [expected_m[:count]]
     while steps < _MOST_STEPS and 2 * steps * nodes <= _MOST_STEPS_IN_ALL:
         heights_m = _simulate_heights(plant, run, (states, start), count, steps)
-        if float(np.sqrt(np.mean((heights_m - expected_m[:count]) ** 2))) < tolerance_m:
+        if any(rms(heights_m - other) < tolerance_m for other in known):
             break
+        known = [expected_m[:count], heights_m]
         steps *= 2
     return _simulate_heights(plant, run, (states, start), nodes, steps)
 
