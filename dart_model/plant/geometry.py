@@ -120,8 +120,9 @@ class Geometry:
         """Jacobians at coordinates `q`, shape (n,)."""
         ends = self._ends_at(q)
         directions = self._directions(ends.gaps_m)
-        moments = _cross(ends.arms_m, directions)
-        wrenches = np.concatenate([moments, np.broadcast_to(directions, moments.shape)], axis=2)
+        wrenches = np.empty((2, len(directions), 6))
+        wrenches[..., :3] = _cross(ends.arms_m, directions)
+        wrenches[..., 3:] = directions
         lower, upper = (wrenches[:, :, None] @ ends.jacobians)[:, :, 0]
         struts = upper - lower
         heights = np.sum(directions * ends.gaps_m, axis=1)

@@ -33,6 +33,9 @@ Integers = NDArray[np.intp]
 _CLOSED, _OPEN = 1e-13, 1e-9
 """Gap (m, or of the axes' directions) at which Newton's method ends, and above which it failed."""
 _NEWTON_STEPS = 50
+_NEAR = 1e-6
+"""Gap, and move that closes it, from which on a step of Newton's method is the last: its error is
+quadratic in the move."""
 _LONGEST_MOVE = 0.1
 """Longest move (m or rad) of the free coordinates that the others follow at once, and of all of
 them in a step of Newton's method: of the ways to close a loop, the one is kept that zero is on."""
@@ -99,6 +102,9 @@ class Loops:
         rank = _rank(every)
         _, _, order = qr(every.T, mode="economic", pivoting=True)
         self._rows = np.sort(np.asarray(order[:rank], np.intp))
+        # Index arrays take as long as the algebra between them.
+        self._rows_of_movable = np.ix_(self._rows, movable)
+        self._block = np.ix_(movable, movable)
         weighted = every[self._rows] * self._preference()[movable]
         _, _, order = qr(weighted, mode="economic", pivoting=True)
         self.dependent = np.sort(movable[np.asarray(order[:rank], np.intp)])
@@ -180,16 +186,15 @@ class Loops:
         Raises:
             ModelError: The place is singular.
         """
-        rows = self._every_row_here()[self._rows]
-        own = rows[:, self._movable]
-        mass = self._dart.getMassMatrix()[np.ix_(self._movable, self._movable)]
+        own = self._every_row_here()[self._rows_of_movable]
+        mass = self._dart.getMassMatrix()[self._block]
         moved = np.linalg.solve(mass, own.T)
         values, vectors = np.linalg.eigh(own @ moved)
         if values[0] < _SINGULAR * values[-1]:
             raise self._singular(q)
         needed = -self._every_acceleration()[self._rows]
         multipliers = vectors @ ((vectors.T @ needed) / values)
-        added = np.zeros(rows.shape[1])
+        added = np.zeros(len(q))
         added[self._movable] = moved @ multipliers
         return multipliers, added
 
@@ -276,13 +281,16 @@ class Loops:
     def _newton(self, q: Array, varied: Integers) -> Array:
         for _ in range(_NEWTON_STEPS):
             gaps = self.gaps(q)
-            if np.abs(gaps).max() < _CLOSED:
+            largest = float(np.abs(gaps).max())
+            if largest < _CLOSED:
                 return q
             step = np.zeros(len(q))
             rows = self._every_row_here()[self._rows]
             step[varied] = np.linalg.lstsq(rows[:, varied], -gaps, rcond=None)[0]
-            step *= min(1.0, _LONGEST_MOVE / max(float(np.abs(step).max()), 1e-300))
-            q = self._move(q, step, 1.0)
+            longest = float(np.abs(step).max())
+            q = self._move(q, step * min(1.0, _LONGEST_MOVE / max(longest, 1e-300)), 1.0)
+            if largest < _NEAR and longest < _NEAR:
+                return q
         if np.abs(self._every_gap(q)).max() > _OPEN:
             raise ModelError(
                 f"model {self._model}: skeleton.loops: cannot be closed with the coordinates "

@@ -380,7 +380,8 @@ class FreeModelEstimator:
         for strut, observer in enumerate(self.observers):
             measured, before, band = received[strut], known[strut], state.bands[strut]
             innovation = None
-            if measured is not None:
+            # A height that no observer uses is logged alone: what its model errs by stays.
+            if measured is not None and observer.requires_height:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
                     return self._start_if_possible(self.restart(state, t_ns), step_input, received)
@@ -557,7 +558,8 @@ class FreeModelEstimator:
 
     def _is_at_limit(self, strut: int, virtual_force_n: float) -> bool:
         """Whether a virtual force is at its limit, so that the model cannot follow."""
-        return abs(virtual_force_n) >= self.observers[strut].force_limit_n
+        limit_n = self.observers[strut].force_limit_n
+        return limit_n > 0.0 and abs(virtual_force_n) >= limit_n
 
     def _settle(self, state: FreeModelState, virtual_forces_n: Sequence[float]) -> FreeModelState:
         """State with the times of the last disturbances, and whether every strut has settled."""

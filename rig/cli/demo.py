@@ -12,7 +12,7 @@ from rig.cli.terminal import JsonFlag, console, print_json, print_text
 from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
-STORIES = (STORY, "quarter_car_road")
+STORIES = (STORY, "quarter_car_road", "four_post")
 """Cases that run the whole method (`rig.demo.story.STORIES`)."""
 
 EXAMPLES = (
@@ -26,8 +26,8 @@ def demo(
         str,
         typer.Option(
             metavar="CASE",
-            help=f"The whole method: {' or '.join(STORIES)}; a run alone: reference, quarter_car "
-            "or dyno.",
+            help=f"The whole method: {', '.join(STORIES)}; a run alone: reference, quarter_car or "
+            "dyno.",
         ),
     ] = STORY,
     seed: Annotated[

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,7 +18,17 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.logged_run import Ended
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.schema import BenchConfig, UndeclaredEffect
+from rig.simulated_bench.schema import (
+    AppliedForce,
+    BenchConfig,
+    StrutMotion,
+    UndeclaredEffect,
+)
+
+_Drive = TypeVar("_Drive", AppliedForce, StrutMotion)
+
+_OTHER_MOTION = 1000
+"""Between the seeds of two motions of a bench."""
 
 Ranges = Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]]
 """Undeclared effects that may be drawn: their family, and the range of each parameter."""
@@ -70,6 +81,23 @@ STORIES: Mapping[str, StoryBench] = {
                 "stop",
                 {
                     "contact_height_m": (0.335, 0.342),
+                    "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
+                    "dissipation_s_per_m": (0.0, 0.3),
+                },
+            ),
+            "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (800.0, 3.0e3)}),
+        },
+    ),
+    "four_post": StoryBench(
+        "four_post",
+        "suspension_fl",
+        {
+            "friction": ("friction", {"coulomb_force_n": (60.0, 150.0)}),
+            "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (3.0e6, 1.0e7)}),
+            "bump_stop": (
+                "stop",
+                {
+                    "contact_height_m": (0.435, 0.442),
                     "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
                     "dissipation_s_per_m": (0.0, 0.3),
                 },
@@ -185,14 +213,18 @@ def build_bench(story: StoryBench, effect: UndeclaredEffect, excitation: int) ->
     """The bench with an effect, and with an excitation that a number draws."""
     bench = load_bench_config(CONFIGS / f"{story.configuration}_bench.yaml")
     update: dict[str, object] = {"undeclared_effects": (effect,), "seed": excitation}
-    for key in ("applied_force", "prescribed_motion"):
-        drive = getattr(bench, key)
-        if drive is not None:
-            components = tuple(
-                component.model_copy(update={"seed": excitation}) for component in drive.components
-            )
-            update[key] = drive.model_copy(update={"components": components})
+    update["applied_force"] = _excited(bench.applied_force, excitation)
+    motions = enumerate(bench.prescribed_motion)
+    update["prescribed_motion"] = tuple(
+        _excited(motion, excitation + _OTHER_MOTION * k) for k, motion in motions
+    )
     return bench.model_copy(update=update)
+
+
+def _excited(drive: _Drive, seed: int) -> _Drive:
+    """The same drive with another seed of its components."""
+    components = tuple(item.model_copy(update={"seed": seed}) for item in drive.components)
+    return drive.model_copy(update={"components": components})
 
 
 def _virtual_force_rms_n(ended: Ended, strut: str) -> float:

@@ -1,4 +1,6 @@
-"""No observer: the strut's force is that of the model's law, and its height is not measured.
+"""No observer: the strut's force is that of the model's law.
+
+If its height is measured, it is logged for a diagnosis and corrects nothing.
 
 An example is a tyre under an observed suspension: its law takes part in the motion and is not
 corrected.

@@ -350,11 +350,6 @@ def _check_heights(
                 f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
                 f"{name}: {{kind: none}} for a strut whose height is not measured"
             )
-        if name in heights and not observer.requires_height:
-            raise InputError(
-                f"{source}: observers.{name}.kind: {observer.kind} takes no height, expected "
-                f"signals.height.{name} to be left out"
-            )
     for name in config.signals.further:
         if not observers[name].fuses_sensors:
             raise InputError(

@@ -1,4 +1,4 @@
-"""What drives the bench over time: the applied force and a prescribed motion."""
+"""What drives the bench over time: the applied force and prescribed motions."""
 
 import math
 from typing import NamedTuple
@@ -36,27 +36,30 @@ class DrivenForce(NamedTuple):
     file_force_n: Floats
 
 
-class DrivenHeight(NamedTuple):
-    """The motion prescribed on a strut.
+class DrivenHeights(NamedTuple):
+    """The motions prescribed on struts, one after another.
 
     Attributes:
-        mean_height_m: Height about which it moves.
+        mean_height_m: Height about which each moves, shape (motions,).
+        firsts: First sine, sweep and file of each motion, and one past the last, shape
+            (3, motions + 1).
         sines: Shape (sines, 3), see `SINE_COLUMNS`, in m.
         sweeps: Shape (sweeps, 5), see `SWEEP_COLUMNS`, in m.
         files: Heights over time, as curves.
     """
 
-    mean_height_m: float
+    mean_height_m: Floats
+    firsts: Integers
     sines: Floats
     sweeps: Floats
     files: Curves
 
 
 class BenchDrive(NamedTuple):
-    """What drives the bench; `prescribed` is unused where no strut has a prescribed motion."""
+    """What drives the bench."""
 
     force: DrivenForce
-    prescribed: DrivenHeight
+    prescribed: DrivenHeights
 
 
 @jit_compile
@@ -111,16 +114,17 @@ def acting_force(drive: DrivenForce, t_s: float) -> float:
 
 
 @jit_compile
-def prescribed_motion(prescribed: DrivenHeight, t_s: float) -> tuple[float, float]:
-    """Prescribed height in m and its rate in m/s. Files and sweeps stay where they end."""
-    height_m = prescribed.mean_height_m
+def prescribed_motion(prescribed: DrivenHeights, motion: int, t_s: float) -> tuple[float, float]:
+    """A prescribed height in m and its rate in m/s. Files and sweeps stay where they end."""
+    height_m = prescribed.mean_height_m[motion]
     rate_m_per_s = 0.0
-    for i in range(prescribed.sines.shape[0]):
+    firsts = prescribed.firsts
+    for i in range(firsts[0, motion], firsts[0, motion + 1]):
         rate_rad_per_s = prescribed.sines[i, 1]
         phase = rate_rad_per_s * t_s + prescribed.sines[i, 2]
         height_m += prescribed.sines[i, 0] * math.sin(phase)
         rate_m_per_s += prescribed.sines[i, 0] * rate_rad_per_s * math.cos(phase)
-    for i in range(prescribed.sweeps.shape[0]):
+    for i in range(firsts[1, motion], firsts[1, motion + 1]):
         amplitude_m = prescribed.sweeps[i, 0]
         end_s = prescribed.sweeps[i, 3]
         turns, frequency_hz = _sweep_turns(prescribed.sweeps[i], min(t_s, end_s))
@@ -128,7 +132,7 @@ def prescribed_motion(prescribed: DrivenHeight, t_s: float) -> tuple[float, floa
         if t_s < end_s:
             phase = 2.0 * math.pi * turns
             rate_m_per_s += amplitude_m * 2.0 * math.pi * frequency_hz * math.cos(phase)
-    for i in range(prescribed.files.first.shape[0] - 1):
+    for i in range(firsts[2, motion], firsts[2, motion + 1]):
         segment = prescribed.files.segments[curve_segment(prescribed.files, i, t_s)]
         start, length, a, b, c, d = segment
         offset = min(max(t_s - start, 0.0), length)

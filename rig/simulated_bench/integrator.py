@@ -10,7 +10,6 @@ import numpy as np
 from rig.simulated_bench.compilation import Floats, jit_compile
 from rig.simulated_bench.drive import BenchDrive
 from rig.simulated_bench.equations_of_motion import (
-    INPUTS,
     BenchMechanics,
     derivatives,
     observe,
@@ -41,7 +40,7 @@ def runge_kutta_step(
         mechanics: The bench.
         t_s: Time at the start of the step in s.
         step_s: Length of the step in s.
-        inputs: Inputs at start, middle and end of the step, shape (3, INPUTS).
+        inputs: Inputs at start, middle and end of the step, shape (3, inputs).
         y: State, shape (states,); changed in place.
         work: Scratch, shape (5, states).
     """
@@ -75,14 +74,15 @@ def advance(
 
     Args:
         mechanics: The bench.
-        drive: Applied force and prescribed motion.
+        drive: Applied force and prescribed motions.
         grid: Times of the records.
         first: Index of the first record.
         y: State at the first record, shape (states,); changed in place.
-        records: Receives the records, shape (records, RECORD_COLUMNS * n + RECORD_EXTRA).
+        records: Receives the records, shape
+            (records, RECORD_COLUMNS * struts + RECORD_EXTRA).
     """
     work = np.zeros((5, y.shape[0]))
-    inputs = np.zeros((3, INPUTS))
+    inputs = np.zeros((3, 1 + 2 * mechanics.prescribed.shape[0]))
     step_s = grid.step_s
     for row in range(records.shape[0]):
         start = (first + row) * grid.substeps

@@ -7,9 +7,17 @@ bodies apart, an applied force points upwards, a height is the length of a strut
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    model_validator,
+)
 
 from can_dbc.errors import InputError, expected_name
 from rig.simulated_bench.effects import EFFECT_KINDS, parameter_error
@@ -37,15 +45,18 @@ Points = Annotated[tuple[float, ...], Field(strict=False, min_length=2, max_leng
 
 
 class Mass(_Section):
-    """A body that moves along the vertical axis.
+    """A body that moves along the vertical axis, or a rigid body that heaves, pitches and rolls.
 
     Attributes:
         name: Name of the body.
         mass_kg: Mass of the body in kg.
+        moments_kg_m2: Moments of inertia of a rigid body about its axes x (roll), y (pitch) and z,
+            in kg·m²; absent for a body that only moves vertically.
     """
 
     name: Name
     mass_kg: Positive
+    moments_kg_m2: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] | None = None
 
 
 class _Curve(_Section):
@@ -94,7 +105,10 @@ class BenchStrut(_Section):
     Attributes:
         name: Name of the strut.
         between: Lower and upper body. The lower one is `world` or the upper body of a strut earlier
-            in the list. Every body is the upper body of exactly one strut.
+            in the list. Every body is the upper body of exactly one strut, a rigid body of three
+            or more.
+        place_m: Where the strut is on a rigid body, along its axes x and y from the centre of mass,
+            in m. Struts are vertical: their height is that of the upper end above the lower one.
         free_length_m: Height at which the deflection is zero in the laws of undeclared effects, in
             m.
         spring: Spring curve, given by points: monotone cubic interpolation between them, linear
@@ -106,6 +120,7 @@ class BenchStrut(_Section):
 
     name: Name
     between: Annotated[tuple[Name, Name], Field(strict=False)]
+    place_m: Annotated[tuple[float, float], Field(strict=False)] | None = None
     free_length_m: Positive
     spring: SpringCurve
     damper: DamperCurve
@@ -486,6 +501,13 @@ class Transmission(_Section):
         return self
 
 
+def _as_list(given: object) -> object:
+    """A single item as a list of one, none as an empty one."""
+    if given is None:
+        return ()
+    return cast("object", given) if isinstance(given, list | tuple) else (given,)
+
+
 class BenchConfig(_Section):
     """A simulated bench, complete.
 
@@ -495,7 +517,8 @@ class BenchConfig(_Section):
         masses: Bodies.
         struts: Struts. Each carries one body; its lower end is the world or another body.
         applied_force: The force that drives the bench, if any; positive upwards.
-        prescribed_motion: The motion that drives a strut, if any (a dyno).
+        prescribed_motion: The motion that drives a strut, if any (a dyno, a road), or a list of
+            such motions.
         temperature: Temperature, common to all dampers: the power that their damper curves
             dissipate heats them, and the air cools them.
         undeclared_effects: Effects of the bench that the bridge's model does not contain.
@@ -509,7 +532,9 @@ class BenchConfig(_Section):
     masses: Annotated[tuple[Mass, ...], Field(strict=False, min_length=1, max_length=20)]
     struts: Annotated[tuple[BenchStrut, ...], Field(strict=False, min_length=1, max_length=20)]
     applied_force: AppliedForce = AppliedForce()
-    prescribed_motion: StrutMotion | None = None
+    prescribed_motion: Annotated[
+        tuple[StrutMotion, ...], Field(strict=False, max_length=20), BeforeValidator(_as_list)
+    ] = ()
     temperature: Temperature = Temperature()
     undeclared_effects: Annotated[
         tuple[UndeclaredEffect, ...], Field(strict=False, max_length=50)
@@ -522,12 +547,13 @@ class BenchConfig(_Section):
     def _check(self) -> Self:
         masses = _unique("masses", [mass.name for mass in self.masses])
         struts = _unique("struts", [strut.name for strut in self.struts])
-        _check_tree(self.struts, masses)
+        _check_tree(self.struts, self.masses)
         if self.applied_force.body is not None:
             _check_known("applied_force.body", self.applied_force.body, masses)
-        if self.prescribed_motion is not None:
-            _check_known("prescribed_motion.strut", self.prescribed_motion.strut, struts)
-            _check_strut_motion(self.prescribed_motion.strut, self.struts, self.undeclared_effects)
+        for motion in self.prescribed_motion:
+            _check_known("prescribed_motion.strut", motion.strut, struts)
+            _check_strut_motion(motion.strut, self.struts, self.undeclared_effects)
+        _unique("prescribed_motion", [motion.strut for motion in self.prescribed_motion])
         for index, effect in enumerate(self.undeclared_effects):
             _check_known(f"undeclared_effects.{index}.strut", effect.strut, struts)
         for index, sent in enumerate(self.transmissions):
@@ -556,6 +582,8 @@ def _check_strut_motion(
     name: str, struts: tuple[BenchStrut, ...], effects: tuple[UndeclaredEffect, ...]
 ) -> None:
     strut = next(strut for strut in struts if strut.name == name)
+    if strut.place_m is not None:
+        raise ValueError(f"prescribed_motion: {name} carries a rigid body, expected another strut")
     if strut.initial_height_m is not None:
         raise ValueError(
             f"struts: {name} has an initial_height_m, expected none: its motion is prescribed"
@@ -568,13 +596,30 @@ def _check_strut_motion(
             )
 
 
-def _check_tree(struts: tuple[BenchStrut, ...], masses: list[str]) -> None:
+def _check_tree(struts: tuple[BenchStrut, ...], masses: tuple[Mass, ...]) -> None:
+    rigid = {mass.name for mass in masses if mass.moments_kg_m2 is not None}
+    names = [mass.name for mass in masses]
     carried: list[str] = []
     for index, strut in enumerate(struts):
         lower, upper = strut.between
+        free = [name for name in names if name not in carried or name in rigid]
         _check_known(f"struts.{index}.between.0", lower, [WORLD, *carried])
-        _check_known(f"struts.{index}.between.1", upper, [m for m in masses if m not in carried])
+        _check_known(f"struts.{index}.between.1", upper, free)
+        _check_place(f"struts.{index}", strut, rigid)
         carried.append(upper)
-    if len(carried) < len(masses):
-        loose = next(mass for mass in masses if mass not in carried)
-        raise ValueError(f"struts: expected one that carries {loose}")
+    for name in names:
+        least = 3 if name in rigid else 1
+        if carried.count(name) < least:
+            expected = f"{least} that carry" if least > 1 else "one that carries"
+            raise ValueError(f"struts: expected {expected} {name}")
+
+
+def _check_place(key: str, strut: BenchStrut, rigid: set[str]) -> None:
+    on_rigid = [name for name in strut.between if name in rigid]
+    if len(on_rigid) > 1:
+        raise ValueError(f"{key}.between: expected a rigid body at one end alone")
+    if bool(on_rigid) != (strut.place_m is not None):
+        expected = "one, the place on the rigid body" if on_rigid else "none without a rigid body"
+        raise ValueError(f"{key}.place_m: expected {expected}")
+    if strut.between[1] in rigid and strut.initial_height_m is not None:
+        raise ValueError(f"{key}.initial_height_m: expected none of a strut below a rigid body")

@@ -69,7 +69,7 @@ def advance_records(
     Raises:
         BenchDivergedError: The motion is no longer finite.
     """
-    struts = len(assembly.mechanics.mass_kg)
+    struts = len(assembly.mechanics.ends.positions)
     records = np.empty((count, RECORD_COLUMNS * struts + RECORD_EXTRA))
     y = motion.y.copy()
     advance(assembly.mechanics, assembly.drive, grid, motion.records, y, records)

@@ -20,10 +20,10 @@ NOISE_M = 1e-5
 def recording(seed, *effects, duration_s=10.0, acceleration=False):
     """Heights and the road at 250 Hz, each with noise."""
     bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
-    moved = bench.prescribed_motion
+    (moved,) = bench.prescribed_motion
     components = tuple(it.model_copy(update={"seed": seed}) for it in moved.components)
     update = {"undeclared_effects": effects, "seed": seed}
-    update["prescribed_motion"] = moved.model_copy(update={"components": components})
+    update["prescribed_motion"] = (moved.model_copy(update={"components": components}),)
     course = simulate(bench.model_copy(update=update), round(duration_s * 1e9), 4_000_000)
     rng = np.random.default_rng(seed)
     measured = course.height_m + NOISE_M * rng.standard_normal(course.height_m.shape)

@@ -27,7 +27,7 @@ SENT = "HEIGHT : 12|24@1- (2E-007,0) [-1.6|1.6]"
 def resting(length_m):
     """A dyno that moves by nanometres."""
     bench = load_bench_config(CONFIGS / "dyno_bench.yaml")
-    motion = bench.prescribed_motion
+    (motion,) = bench.prescribed_motion
     (component,) = motion.components
     still = motion.model_copy(
         update={

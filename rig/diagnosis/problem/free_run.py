@@ -43,7 +43,7 @@ from rig.diagnosis.problem.grid import (
     fine_times,
 )
 from rig.diagnosis.problem.linear_dynamics import FilterMechanism, LinearDynamics, system_matrix
-from rig.diagnosis.problem.mechanism import LinearisedMechanism, mechanism_along
+from rig.diagnosis.problem.mechanism import LinearisedMechanism, mechanism_along, solve_nearest
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
@@ -170,8 +170,8 @@ class FreeRunProblem(Problem):
         grid, mechanism = self.runs[k].grid, self.runs[k].mechanism
         heights, velocities = first_motion(grid)
         jacobian, (moved_m, moved) = mechanism.jacobian[0], self.runs[k].moved_at_nodes[0]
-        q = mechanism.q[0] + np.linalg.solve(jacobian, heights - mechanism.heights_m[0] - moved_m)
-        v = np.linalg.solve(jacobian, velocities - moved)
+        q = mechanism.q[0] + solve_nearest(jacobian, heights - mechanism.heights_m[0] - moved_m)
+        v = solve_nearest(jacobian, velocities - moved)
         return np.concatenate([q, v, np.zeros(slots_of(self, candidate).states)])
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:

@@ -11,7 +11,7 @@ from dart_model.effects import Motion
 from rig.diagnosis.numerics.compiled import respond
 from rig.diagnosis.problem import linear_part
 from rig.diagnosis.problem.grid import Track
-from rig.diagnosis.problem.mechanism import LinearisedMechanism
+from rig.diagnosis.problem.mechanism import LinearisedMechanism, solve_nearest
 from rig.diagnosis.problem.problem import LinearParameter
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class FilterMechanism:
         """Generalised force (N, n) of a unit change of a parameter; accelerations (N, struts)."""
         strut = parameter.strut
         if parameter.kind == "mass":
-            q = np.linalg.solve(self.jacobian, accelerations_m_per_s2[..., np.newaxis])[..., 0]
+            q = solve_nearest(self.jacobian, accelerations_m_per_s2)
             inertia = np.einsum("kij,kj->ki", self._mechanism.mass_by_kg[self._at, strut], q)
             inputs = self._mechanism.inputs_by_kg[self._at, strut]
             driven = np.einsum("kij,kj->ki", inputs, self._inputs)

@@ -81,7 +81,8 @@ def linear_parameters(
             ("preload", 0.0, preload_scale, -np.inf),
             ("free_length", strut.free_length_m, motion.stroke_m, -np.inf),
         ]
-        if bench == "force_given" and i != scale_strut:
+        is_first = all(strut.carried != other.carried for other in spec.struts[:i])
+        if bench == "force_given" and i != scale_strut and is_first:
             mass = masses[i]
             kinds.append(("mass", mass, mass, -(1.0 - _LEAST_MASS) * mass))
         parameters += [

@@ -81,19 +81,22 @@ class LinearisedMechanism(NamedTuple):
         """
         every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
-        q = self.q[every] + _solve_coordinates(jacobian, z - self.heights_m[every] - moved[:, 0])
-        v = _solve_coordinates(jacobian, w - moved[:, 1])
-        acceleration = _solve_coordinates(jacobian, a)
+        q = self.q[every] + solve_nearest(jacobian, z - self.heights_m[every] - moved[:, 0])
+        v = solve_nearest(jacobian, w - moved[:, 1])
+        acceleration = solve_nearest(jacobian, a)
         bias = self.bias[every] + np.einsum("kij,kj->ki", self.inputs[every], inputs)
         bias = bias + np.einsum("kij,kj->ki", self.bias_q[every], q - self.q[every])
         bias = bias + np.einsum("kij,kj->ki", self.bias_v[every], v - self.v[every])
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
-        return _solve_coordinates(np.swapaxes(jacobian, 1, 2), generalised)
+        return solve_nearest(np.swapaxes(jacobian, 1, 2), generalised)
 
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""
-        transposed = np.swapaxes(self.jacobian[:1], 1, 2)[0]
-        return np.abs(np.linalg.solve(transposed, self.mass[0] @ np.linalg.inv(self.jacobian[0])))
+        jacobian = self.jacobian[0]
+        every = np.eye(len(jacobian))
+        accelerations = np.column_stack([solve_nearest(jacobian, column) for column in every])
+        forces = self.mass[0] @ accelerations
+        return np.abs(np.column_stack([solve_nearest(jacobian.T, column) for column in forces.T]))
 
 
 class MechanismPlants(NamedTuple):
@@ -114,10 +117,10 @@ def open_plants(spec: ModelSpec) -> MechanismPlants:
         kept = [e for e in strut.effects if e.name in ("added_mass", "inerter")]
         bare = bare.with_effects(strut.name, kept)
     plain = DartPlant(bare)
-    if plain.free_coordinates != len(spec.struts):
+    if plain.free_coordinates > len(spec.struts):
         raise RecordingError(
             f"model {spec.name}: {plain.free_coordinates} coordinates and {len(spec.struts)} "
-            "struts, expected as many of each, so that the measured heights give the motion"
+            "struts, expected as many struts or more, so that the measured heights give the motion"
         )
     heavier = tuple(
         DartPlant(bare.with_effects(strut.name, (*bare.strut(strut.name).effects, _ONE_KG)))
@@ -154,8 +157,8 @@ def _with_mockups(
     nodes = len(motion.t_s)
     m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
     heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
-    q = m.q + _solve_coordinates(m.jacobian, heights_m - m.heights_m)
-    v = _solve_coordinates(m.jacobian, velocities)
+    q = m.q + solve_nearest(m.jacobian, heights_m - m.heights_m)
+    v = solve_nearest(m.jacobian, velocities)
     bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
     bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
     bias_q, bias_v = m.bias_q, m.bias_v
@@ -241,6 +244,13 @@ def _stack(entries: list[LinearisedMechanism]) -> LinearisedMechanism:
     )
 
 
-def _solve_coordinates(jacobian: Array, heights: Array) -> Array:
-    """Coordinates (K, n) of heights (K, struts), about the reference."""
-    return np.asarray(np.linalg.solve(jacobian, heights[..., np.newaxis])[..., 0], np.float64)
+def solve_nearest(rows: Array, values: Array) -> Array:
+    """What gives values (..., m) by rows (..., m, n) best, and of all that do the least.
+
+    With as many struts as coordinates it gives them exactly. With more struts, coordinates of
+    measured heights are the nearest ones, and forces in the struts those without a part that is in
+    balance with itself.
+    """
+    if rows.shape[-1] == rows.shape[-2]:
+        return np.asarray(np.linalg.solve(rows, values[..., np.newaxis])[..., 0], np.float64)
+    return np.asarray((np.linalg.pinv(rows) @ values[..., np.newaxis])[..., 0], np.float64)
