@@ -129,9 +129,11 @@ def status_line(
         if look.t_ns > shown_ns and look.ticks > shown_ticks:
             parts.append(f"{(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz")
         shown_ns, shown_ticks = look.t_ns, look.ticks
-        # Of several struts, the one with the largest force: there is one line.
-        strongest = sorted(look.output.struts, key=lambda item: -abs(item.force_n))[:1]
-        for strut in strongest:
+        # Of several struts, the one with the largest force: there is one line. One that is not
+        # observed, such as a tyre, shows less.
+        observed = [item for item in look.output.struts if item.innovation_m == item.innovation_m]
+        strongest = sorted(observed or look.output.struts, key=lambda item: -abs(item.force_n))
+        for strut in strongest[:1]:
             parts.append(f"force {strut.force_n:+7.1f} N")
             parts.append(f"height error {strut.innovation_m * 1e3:+7.3f} mm")
         if look.late_ns is not None:

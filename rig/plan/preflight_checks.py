@@ -645,7 +645,7 @@ def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     """Which of the struts' forces are observable from the heights, and which are not."""
     names = plan.strut_names
     linear = linear_model(plant, [strut.free_length_m for strut in plan.struts])
-    measured = [channel.strut for channel in plan.heights]
+    measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
     forces = [Unknown(f"the residual force of {names[i]}", i) for i in measured]
     result = observability(linear, measured, forces)
     hidden = [*(item.name for item in result.hidden), *map(_pair, result.confused)]

@@ -107,7 +107,7 @@ def tune(
         raise InputError(
             f"{plan.source}: prescribed_motion: no loop is closed, expected a free model"
         )
-    if len(plan.struts) > len(plan.heights):
+    if not all(strut.observer.requires_height for strut in plan.struts):
         raise InputError(
             f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
             "a height of each strut"

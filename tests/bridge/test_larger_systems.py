@@ -119,3 +119,14 @@ def test_a_tyre_that_nobody_measures_is_what_its_law_says():
     # Its height at the start is not known, the model begins at rest on it.
     missed = (found[:, 1] - truth)[1000:]
     assert np.sqrt(np.mean(missed**2)) < 0.1 * np.std(truth)
+
+
+def test_a_height_that_no_observer_uses_corrects_nothing():
+    model, heights_m, applied_n, _ = quarter_car(duration_s=1.0)
+    observers = NoObserver("none"), OBSERVER
+    plant = wrong(model, names=["tyre"])
+    measured = noisy(heights_m)
+    unmeasured = measured.copy()
+    unmeasured[:, 0] = np.nan
+    found = [follow(plant, seen, applied_n, observers) for seen in (measured, unmeasured)]
+    assert np.array_equal(*found, equal_nan=True)

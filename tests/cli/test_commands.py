@@ -197,8 +197,8 @@ def test_a_run_without_a_file_is_one_line_and_exit_code_2(
         (
             "sead",
             "found",
-            "model 'sead': expected a file in ., or one of bench, quarter_car, quarter_car_road, "
-            "reference",
+            "model 'sead': expected a file in ., or one of bench, four_post, quarter_car, "
+            "quarter_car_road, reference",
         ),
         ("none.yaml", "found", "model 'none.yaml': expected a file"),
     ],

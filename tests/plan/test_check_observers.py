@@ -77,11 +77,11 @@ def test_without_a_height_the_check_says_what_is_lost():
 def test_a_strut_that_nobody_measures_has_to_be_declared(tmp_path):
     with pytest.raises(InputError, match=r"signals.height.tyre: is missing.*kind: none"):
         quarter(tmp_path, "{suspension: {kind: pi}}", f"{{{SUSPENSION}}}")
-    with pytest.raises(InputError, match=r"observers.tyre.kind: none takes no height"):
-        quarter(tmp_path, "{tyre: {kind: none}}", f"{{{TYRE}, {SUSPENSION}}}")
-    ready = quarter(tmp_path, "{tyre: {kind: none}}", f"{{{SUSPENSION}}}")
-    found = {item.what: item for item in check(ready)}
-    assert found["observability"].text == "the residual force of suspension is observable"
+    # Whether its height is logged makes no difference to what is observed.
+    for heights in (f"{{{SUSPENSION}}}", f"{{{TYRE}, {SUSPENSION}}}"):
+        ready = quarter(tmp_path, "{tyre: {kind: none}}", heights)
+        found = {item.what: item for item in check(ready)}
+        assert found["observability"].text == "the residual force of suspension is observable"
 
 
 def test_a_height_that_is_old_goes_stale_later(tmp_path):
