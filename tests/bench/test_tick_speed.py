@@ -340,7 +340,7 @@ def steps_of(plant: DartPlant, height_m: float) -> Subject:
 
 
 def test_a_closed_loop_fits_into_a_tick_of_a_millisecond(capsys):
-    """It takes half a millisecond where this is measured, and a body on a guide 15 us."""
+    """It takes half a millisecond where this is measured, and a body on a guide 6 us."""
     corner = double_wishbone()
     looped = DartPlant(parse_model(json.dumps(corner.content), "double wishbone"))
     found = compare_rounds(
@@ -350,7 +350,7 @@ def test_a_closed_loop_fits_into_a_tick_of_a_millisecond(capsys):
         },
         capsys,
     )
-    assert np.median(found["double wishbone"] / found["plant alone"]) <= 50.0  # measured: 36
+    assert np.median(found["double wishbone"] / found["plant alone"]) <= 110.0  # measured: 80
 
 
 def test_a_tick_over_a_virtual_bus(capsys):

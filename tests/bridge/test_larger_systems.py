@@ -27,10 +27,10 @@ OBSERVER = KalmanObserver(
 RATE_HZ = 1000
 
 
-def follow(plant, heights_m, applied_n, observers=None):
+def follow(plant, heights_m, applied_n, observers=None, rate_hz=RATE_HZ):
     """Published forces, shape (N, struts), NaN before the model started."""
     count = heights_m.shape[1]
-    period_ns = round(1e9 / RATE_HZ)
+    period_ns = round(1e9 / rate_hz)
     bench = channels(count, interval_ns=period_ns)
     core = supervised(plant, observers or (OBSERVER,) * count, SUPERVISION, bench)
     state = core.init(0)
