@@ -343,7 +343,8 @@ class FreeRunProblem(Problem):
         deviation = (
             spread[2] @ inertia.T + constants[:, 2] * spread[1] + constants[:, 1] * spread[0]
         )
-        return ResidualForces(run.grid.name, along, needed.T - forces, deviation.T)
+        acting = m.without_balance(forces.T).T
+        return ResidualForces(run.grid.name, along, needed.T - acting, deviation.T)
 
     def forces_over_time(
         self, k: int, model: CandidateModel, delays: Sequence[int]

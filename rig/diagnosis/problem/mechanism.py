@@ -90,6 +90,18 @@ class LinearisedMechanism(NamedTuple):
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
         return solve_nearest(np.swapaxes(jacobian, 1, 2), generalised)
 
+    def without_balance(self, forces: Array) -> Array:
+        """Strut forces (N, struts) without a part that is in balance with itself.
+
+        There is such a part only where there are more struts than coordinates: no motion shows it.
+        """
+        _, struts, n = self.jacobian.shape
+        if struts == n:
+            return forces
+        jacobian = self.jacobian[np.arange(len(forces)) if len(self.q) > 1 else slice(None)]
+        transposed = np.swapaxes(jacobian, 1, 2)
+        return solve_nearest(transposed, (transposed @ forces[..., np.newaxis])[..., 0])
+
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""
         jacobian = self.jacobian[0]
