@@ -38,7 +38,7 @@ def resting(length_m):
     fast, slow = bench.transmissions
     height = fast.height.model_copy(update={"noise_std_m": NOISE_M})
     fast = fast.model_copy(update={"height": height})
-    return bench.model_copy(update={"prescribed_motion": still, "transmissions": (fast, slow)})
+    return bench.model_copy(update={"prescribed_motion": (still,), "transmissions": (fast, slow)})
 
 
 @pytest.fixture(scope="module")
