@@ -66,7 +66,7 @@ def delay_parameters(spec: ModelSpec, recording: Recording) -> tuple[LinearParam
 
 def is_undetermined(parameter: LinearParameter) -> bool:
     """Whether it is a delay of which the data showed nothing before the search."""
-    return parameter.kind == "delay" and parameter.most - parameter.least >= 2.0 * UNKNOWN_S
+    return parameter.kind == "delay" and parameter.most == -parameter.least == UNKNOWN_S
 
 
 def _parameter(recording: Recording, strut: int, index: int, channel: str) -> LinearParameter:

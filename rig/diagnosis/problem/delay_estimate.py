@@ -58,11 +58,16 @@ def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
 
 
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
-    """A delay that is searched for about an estimate, of which the recordings know the error."""
+    """A delay that is searched for from an estimate on, of which the recordings know the error.
+
+    None at all remains possible: friction that weakens with speed was taken for 3 ms.
+    """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
     width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
     return parameter._replace(
-        expected=expected_s, least=expected_s - width_s, most=expected_s + width_s
+        expected=expected_s,
+        least=min(expected_s - width_s, -_LEAST_WIDTH_S),
+        most=max(expected_s + width_s, _LEAST_WIDTH_S),
     )
 
 
