@@ -23,6 +23,9 @@ _ITERATIONS = 6
 _WIDTH, _LEAST_WIDTH_S = 5.0, 0.5e-3
 """Standard deviations about an estimate, and least time, within which a delay is searched for: the
 functions of the estimate bend less than a stop, whose contact it takes for 0.1 ms."""
+_VAGUE_S = 0.2e-3
+"""Standard deviation from which on an estimate is vague: friction that weakens with speed was taken
+for a delay of 3.3 ms, with one of 0.27; delays that are there are known to some microseconds."""
 _MARGIN_S = 0.01
 """Time at either end of a recording where the smoothed motion is not used."""
 _MOST_SAMPLES = 40_000
@@ -60,15 +63,14 @@ def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
     """A delay that is searched for from an estimate on, of which the recordings know the error.
 
-    None at all remains possible: friction that weakens with speed was taken for 3 ms.
+    Of a vague estimate, none at all remains possible.
     """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
     width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
-    return parameter._replace(
-        expected=expected_s,
-        least=min(expected_s - width_s, -_LEAST_WIDTH_S),
-        most=max(expected_s + width_s, _LEAST_WIDTH_S),
-    )
+    least, most = expected_s - width_s, expected_s + width_s
+    if std_s > _VAGUE_S:
+        least, most = min(least, -_LEAST_WIDTH_S), max(most, _LEAST_WIDTH_S)
+    return parameter._replace(expected=expected_s, least=least, most=most)
 
 
 def _step(problem: Problem, which: Sequence[int], delays_s: Array) -> DelayStep | None:
