@@ -66,11 +66,8 @@ def _of_sdf(root: Element, path: Path) -> Iterator[LoopSpec]:
 def _first_model(root: Element) -> Element:
     """The model that DART reads."""
     worlds = [item for item in root.children if item.name == "world"]
-    for place in (root, *worlds):
-        for item in place.children:
-            if item.name == "model":
-                return item
-    return Element("model", {})
+    models = (item for part in (root, *worlds) for item in part.children if item.name == "model")
+    return next(models, Element("model", {}))
 
 
 def _of_sdf_joint(joint: Element, child: str, path: Path) -> LoopSpec:
@@ -81,7 +78,7 @@ def _of_sdf_joint(joint: Element, child: str, path: Path) -> LoopSpec:
             f"{where}: type {kind[:100]!r}: closes a loop, because {child[:100]} is the child of "
             "another joint too, expected ball or revolute"
         )
-    pose = next((item for item in joint.children if item.name == "pose"), Element("pose", {}))
+    pose = joint.child("pose")
     if pose.attributes.get("relative_to", child) != child:
         raise ModelError(f"{where}: pose relative_to: expected the child, or none")
     numbers = [float(word) for word in pose.text.split()] or [0.0] * 6
@@ -93,8 +90,8 @@ def _of_sdf_joint(joint: Element, child: str, path: Path) -> LoopSpec:
 
 def _axis(joint: Element, turned_rad: list[float], where: str) -> list[float]:
     """Axis of a joint in its child's frame, from that of the joint."""
-    axis = next((item for item in joint.children if item.name == "axis"), Element("axis", {}))
-    xyz = next((item for item in axis.children if item.name == "xyz"), Element("xyz", {}))
+    axis = joint.child("axis")
+    xyz = axis.child("xyz")
     if axis.child_text("use_parent_model_frame") in ("1", "true"):
         raise ModelError(f"{where}: axis use_parent_model_frame: expected 0, or none")
     if xyz.attributes.get("expressed_in", "") != "":

@@ -22,9 +22,13 @@ class Element:
     text: str = ""
     is_text_complete: bool = False
 
+    def child(self, name: str) -> "Element":
+        """The first child of a name, an empty one if there is none."""
+        return next((child for child in self.children if child.name == name), Element(name, {}))
+
     def child_text(self, name: str) -> str:
         """Text of the first child of a name, empty if there is none."""
-        return next((child.text.strip() for child in self.children if child.name == name), "")
+        return self.child(name).text.strip()
 
 
 def walk(element: Element) -> Iterator[Element]:

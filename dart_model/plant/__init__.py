@@ -369,10 +369,10 @@ class DartPlant:
         ``spread @ w' + curved``, and what the loops carry does no work on w.
         """
         movable, moved = self._skeleton.inputs.free, self._skeleton.inputs.moved
+        spread = loops.spread(q)
         curved = np.zeros(self.coordinates)
         own = loops.jacobian(q)[:, loops.dependent]
         curved[loops.dependent] = -np.linalg.solve(own, loops.curvature())
-        spread = loops.spread(q)
         basis, mass = spread[np.ix_(movable, loops.free)], tree.mass
         inputs, by_motion = tree.inputs, tree.moved
         if moved is not None:
@@ -412,7 +412,7 @@ class DartPlant:
     def _bias_at(self, q: Array, v: Array) -> Array:
         """Bias force with the free and moved coordinates and rates of `q` and `v`."""
         q = self._closed(q)
-        return self.mechanics(q, v if self._skeleton.loops is None else self._spread(q) @ v).bias
+        return self.mechanics(q, self._spread(q) @ v).bias
 
     @property
     def is_constant(self) -> bool:

@@ -33,6 +33,8 @@ Integers = NDArray[np.intp]
 _CLOSED, _OPEN = 1e-13, 1e-9
 """Gap (m, or of the axes' directions) at which Newton's method ends, and above which it failed."""
 _NEWTON_STEPS = 50
+"""Newton's method doubles its digits at each step, once it is near; before, this is five metres or
+radians on the way."""
 _NEAR = 1e-6
 """Gap, and move that closes it, from which on a step of Newton's method is the last: its error is
 quadratic in the move."""
@@ -111,6 +113,7 @@ class Loops:
         """Indices of the coordinates that follow from the others."""
         self.free = np.setdiff1d(movable, self.dependent)
         """Indices of the coordinates that are free to move."""
+        self._given = np.setdiff1d(np.arange(len(zero)), self.dependent)
         if not len(self.free):
             raise ModelError(
                 f"model {model}: skeleton.loops: nothing is left that moves, expected "
@@ -138,7 +141,7 @@ class Loops:
 
     def reach(self, q: Array) -> Array:
         """The same on the way from zero, whatever the others are in `q`."""
-        given = np.setdiff1d(np.arange(len(q)), self.dependent)
+        given = self._given
         here = np.zeros(len(q))
         steps = max(1, int(np.ceil(np.abs(q[given]).max(initial=0.0) / _LONGEST_MOVE)))
         for step in range(1, steps + 1):
@@ -166,10 +169,9 @@ class Loops:
         Raises:
             ModelError: The place is singular.
         """
-        rows = self.jacobian(q)
+        rows, given = self.jacobian(q), self._given
         every = np.eye(len(q))
         every[:, self.dependent] = 0.0
-        given = np.setdiff1d(np.arange(len(q)), self.dependent)
         own = rows[:, self.dependent]
         if _rank(own) < len(own):
             raise self._singular(q)
@@ -333,7 +335,7 @@ class Loops:
         if not is_regular or _rank(self._every_row(near)[:, self._movable]) != rank:
             raise ModelError(
                 f"model {self._model}: skeleton.loops: the place where all coordinates are zero is "
-                "singular: beside it the loops hold more than there, expected one from which the "
+                "singular: near it the loops hold more than there, expected one from which the "
                 "bodies move as they do elsewhere"
             )
 

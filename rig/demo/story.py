@@ -49,6 +49,23 @@ class StoryBench:
     effects: Ranges
 
 
+def _of_suspension(coulomb_n: tuple[float, float], contact_m: tuple[float, float]) -> Ranges:
+    """Effects of a car's suspension, with ranges of its friction and of its stop's contact."""
+    return {
+        "friction": ("friction", {"coulomb_force_n": coulomb_n}),
+        "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (3.0e6, 1.0e7)}),
+        "bump_stop": (
+            "stop",
+            {
+                "contact_height_m": contact_m,
+                "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
+                "dissipation_s_per_m": (0.0, 0.3),
+            },
+        ),
+        "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (800.0, 3.0e3)}),
+    }
+
+
 STORIES: Mapping[str, StoryBench] = {
     "story": StoryBench(
         "story",
@@ -72,38 +89,10 @@ STORIES: Mapping[str, StoryBench] = {
         },
     ),
     "quarter_car_road": StoryBench(
-        "quarter_car_road",
-        "suspension",
-        {
-            "friction": ("friction", {"coulomb_force_n": (40.0, 120.0)}),
-            "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (3.0e6, 1.0e7)}),
-            "bump_stop": (
-                "stop",
-                {
-                    "contact_height_m": (0.335, 0.342),
-                    "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
-                    "dissipation_s_per_m": (0.0, 0.3),
-                },
-            ),
-            "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (800.0, 3.0e3)}),
-        },
+        "quarter_car_road", "suspension", _of_suspension((40.0, 120.0), (0.335, 0.342))
     ),
     "four_post": StoryBench(
-        "four_post",
-        "suspension_fl",
-        {
-            "friction": ("friction", {"coulomb_force_n": (60.0, 150.0)}),
-            "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (3.0e6, 1.0e7)}),
-            "bump_stop": (
-                "stop",
-                {
-                    "contact_height_m": (0.435, 0.442),
-                    "contact_stiffness_n_per_m1_5": (1.0e6, 4.0e6),
-                    "dissipation_s_per_m": (0.0, 0.3),
-                },
-            ),
-            "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (800.0, 3.0e3)}),
-        },
+        "four_post", "suspension_fl", _of_suspension((60.0, 150.0), (0.435, 0.442))
     ),
 }
 """Benches by the name of their case."""

@@ -76,27 +76,25 @@ def assemble(config: BenchConfig) -> Assembly:
 
 def _mechanics(config: BenchConfig) -> BenchMechanics:
     thermal, firsts = config.temperature, _first_positions(config)
-    rigid = [mass for mass in config.masses if mass.moments_kg_m2 is not None]
-    rigid_names = {mass.name for mass in rigid}
+    rigid = {it.name: it.moments_kg_m2 for it in config.masses if it.moments_kg_m2 is not None}
     ends = [[firsts.get(name, -1) for name in strut.between] for strut in config.struts]
     inertia, is_height = _inertia(config, firsts)
-    moments = [mass.moments_kg_m2 or (0.0, 0.0, 0.0) for mass in rigid]
     return BenchMechanics(
         gravity_m_per_s2=config.gravity_m_per_s2,
         inertia=inertia,
         is_height=is_height,
         rigid=RigidBodies(
-            first=np.array([firsts[mass.name] for mass in rigid], dtype=np.int64),
-            more_kg_m2=np.array([z - y for _, y, z in moments], dtype=np.float64),
+            first=np.array([firsts[name] for name in rigid], dtype=np.int64),
+            more_kg_m2=np.array([z - y for _, y, z in rigid.values()], dtype=np.float64),
         ),
         ends=Ends(
             size=len(inertia),
             positions=np.array(ends),
             is_rigid=np.array(
-                [[name in rigid_names for name in strut.between] for strut in config.struts],
+                [[name in rigid for name in strut.between] for strut in config.struts],
                 dtype=np.int64,
             ),
-            places_m=_places(config, rigid_names),
+            places_m=_places(config, set(rigid)),
         ),
         driven=firsts[config.applied_force.body or config.struts[0].between[1]],
         prescribed=np.array(

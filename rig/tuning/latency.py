@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from dart_model.spec import ModelSpec
 from rig.channels.measured_quantities import HEIGHT
-from rig.diagnosis.problem.build import build
+from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.problem.delay_estimate import estimate_delays
 from rig.plan.plan import Plan
 from rig.recordings.read import read_recording
@@ -74,7 +74,8 @@ def estimate_latencies(folder: Path, model: ModelSpec, struts: Sequence[str]) ->
     """
     try:
         recording = read_recording(folder, struts)
-        found = estimate_delays(build(model, [recording], _BLOCKS, None))
+        problem = build_without_delays(model, [recording], _BLOCKS, None)
+        found = estimate_delays(problem)
     except RecordingError:
         return [Latency(0.0, math.inf)] * len(struts)
     latencies: list[Latency] = []

@@ -110,7 +110,7 @@ def tune(
     if not all(strut.observer.requires_height for strut in plan.struts):
         raise InputError(
             f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
-            "a height of each strut"
+            "an observer of each strut"
         )
     if isinstance(source, StatedExpectation) and source.up_to_hz >= 0.5e9 / plan.period_ns:
         raise InputError(

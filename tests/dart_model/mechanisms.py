@@ -183,6 +183,19 @@ def macpherson() -> Mechanism:
     )
 
 
+STOP_N_PER_M = 150_000.0
+CONTACT_M = {double_wishbone: 0.545, macpherson: 0.335}
+"""Length of the strut at which a bump stop acts that a model lacks, by the mechanism's maker."""
+
+
+def with_stop(make) -> Mechanism:
+    """A mechanism with a linear bump stop in parallel with its strut."""
+    contact_m = CONTACT_M[make]
+    return make()._replace(
+        undeclared_n=lambda length_m, _rate: STOP_N_PER_M * max(0.0, contact_m - length_m)
+    )
+
+
 def _unit(angle):
     return np.array([math.cos(angle), math.sin(angle)])
 

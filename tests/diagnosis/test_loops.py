@@ -7,20 +7,21 @@ import pytest
 
 from dart_model.spec import parse_model
 from rig.diagnosis.diagnose import diagnose
-from tests.dart_model.mechanisms import double_wishbone, exact_angles, macpherson
+from tests.dart_model.mechanisms import (
+    CONTACT_M,
+    double_wishbone,
+    exact_angles,
+    macpherson,
+    with_stop,
+)
 from tests.diagnosis.mechanisms import lines_n, recording
 
-STOP_N_PER_M = 150_000.0
-CONTACT_M = {double_wishbone: 0.545, macpherson: 0.335}
 TONES_HZ = (0.7, 1.3, 2.1, 3.4, 5.2, 7.9)
 
 
 def recorded(make, seed):
     """A run of ten seconds at 500 Hz, with a stop that the model does not have."""
-    contact_m = CONTACT_M[make]
-    bench = make()._replace(
-        undeclared_n=lambda length, _: STOP_N_PER_M * max(0.0, contact_m - length)
-    )
+    bench = with_stop(make)
     load_n = lines_n(900.0, TONES_HZ, shift=3.7 * seed)
     t_s = np.arange(0.0, 10.0, 2e-3)
     angles = exact_angles(bench, t_s, load_n, rtol=1e-8)

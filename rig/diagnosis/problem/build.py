@@ -83,6 +83,17 @@ def build(
     Raises:
         RecordingError: A recording or the model cannot be used; one line says why.
     """
+    return with_estimated_delays(build_without_delays(spec, recordings, blocks, held_out_every))
+
+
+def build_without_delays(
+    spec: ModelSpec, recordings: Sequence[Recording], blocks: int, held_out_every: int | None
+) -> Problem:
+    """The same before the delays of its channels are estimated.
+
+    Raises:
+        RecordingError: As of `build`.
+    """
     kind = problem_kind(recordings)
     for recording in recordings:
         check_fits(recording, spec)
@@ -101,7 +112,7 @@ def build(
     linear += delay_parameters(spec, first.recording)
     existing = track.existing_effects(spec, [recording.motion for recording in smooth])
     basis = ProblemBasis(spec, linear, existing, motions, block_s, plants)
-    return with_estimated_delays(_divide_at_gaps(kind.of_recordings(basis, smooth), smooth))
+    return _divide_at_gaps(kind.of_recordings(basis, smooth), smooth)
 
 
 def _smooth(

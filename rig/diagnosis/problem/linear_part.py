@@ -65,8 +65,8 @@ def linear_parameters(
     Where no force drives the bench, the data determine masses, stiffnesses, dampings and forces of
     laws up to a common factor: the largest moving mass is then not corrected, and sets the scale.
     """
-    masses = [moving_mass_kg(spec, mechanism, i) for i in range(len(motions))]
-    scale_strut = -1 if drive.has_force else int(np.argmax(masses))
+    masses_kg = [motion.mass_kg for motion in motions]
+    scale_strut = -1 if drive.has_force else int(np.argmax(masses_kg))
     parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
         stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
@@ -83,7 +83,7 @@ def linear_parameters(
         ]
         is_first = all(strut.carried != other.carried for other in spec.struts[:i])
         if bench == "force_given" and i != scale_strut and is_first:
-            mass = masses[i]
+            mass = masses_kg[i]
             kinds.append(("mass", mass, mass, -(1.0 - _LEAST_MASS) * mass))
         parameters += [
             LinearParameter(i, kind, value, _deviation(spec, kind, scale), least)

@@ -105,10 +105,8 @@ class LinearisedMechanism(NamedTuple):
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""
         jacobian = self.jacobian[0]
-        every = np.eye(len(jacobian))
-        accelerations = np.column_stack([solve_nearest(jacobian, column) for column in every])
-        forces = self.mass[0] @ accelerations
-        return np.abs(np.column_stack([solve_nearest(jacobian.T, column) for column in forces.T]))
+        accelerations = solve_nearest(jacobian, np.eye(len(jacobian)))
+        return np.abs(solve_nearest(jacobian.T, accelerations @ self.mass[0].T).T)
 
 
 class MechanismPlants(NamedTuple):
