@@ -144,8 +144,10 @@ class Plant(Protocol[StateT, LoadedT]):
         """A state as numbers, for differences of a step."""
         ...
 
-    def state_of(self, numbers: Sequence[float]) -> StateT:
-        """The state that `numbers` returned."""
+    def state_of(
+        self, numbers: Sequence[float], t_s: float = 0.0, inputs: Sequence[float] | None = None
+    ) -> StateT:
+        """The state that `numbers` returned; bodies that are moved are at zero without inputs."""
         ...
 
 

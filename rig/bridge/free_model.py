@@ -18,9 +18,10 @@ from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import TEMPERATURE
-from rig.closed_loop.decoupling import Matrix, combine, combine_stds, decouple
-from rig.closed_loop.strut_response import strut_responses
-from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
+from rig.closed_loop.strut_response import linearise
+from rig.observers.error_model import StrutResponse
+from rig.observers.protocol import AnyObserver, Innovation, Start
+from rig.observers.strut_observers import ObserversState, StrutObservers
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
 
 _AT_ONCE = 4
@@ -35,8 +36,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
         temperature_c: Last damper temperature.
         first: Of each strut the measurements that arrived before the model started, the oldest
             first.
-        observers: State of each strut's observer; while the model waits that before it stopped,
-            empty before its first start.
+        observers: State of the struts' observers; while the model waits that before it stopped.
         model: The model under its forces; None while it waits for measurements.
         past: The model at the ticks before the last, the newest first, as far back as a measurement
             may be old; empty where none is late.
@@ -46,13 +46,12 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
-        decoupling: From the observers' forces to the struts', see `rig.closed_loop.decoupling`.
     """
 
     t_ns: int
     temperature_c: float
     first: tuple[tuple[Sample, ...], ...]
-    observers: tuple[ObserverState, ...] = ()
+    observers: ObserversState = ObserversState()
     model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
     disturbed_ns: tuple[int, ...] = ()
@@ -60,7 +59,6 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
-    decoupling: Matrix = ()
 
 
 _Received = Sequence[Sample | None]
@@ -102,6 +100,7 @@ class FreeModelEstimator:
             )
         self._plant = plant
         self.observers = tuple(observers)
+        self._observers = StrutObservers(observers)
         self._channels = tuple(channels)
         self._stale_after_ns = stale_after_ns
         self._settling_times = settling_times
@@ -272,45 +271,42 @@ class FreeModelEstimator:
     def _start(self, state: FreeModelState) -> tuple[FreeModelState, Estimate]:
         """Start the model at the measured heights and at their velocities."""
         t_ns, first = state.t_ns, state.first
-        starts = [start_of_motion(samples, t_ns) for samples in first]
-        heights, velocities = [[item[i] for item in starts] for i in (0, 1)]
+        motions = [start_of_motion(samples, t_ns) for samples in first]
+        heights, velocities = zip(*motions, strict=True)
         inputs = self._input_vector(state.inputs, t_ns)
         model = self._plant.init(heights, velocities, t_ns * 1e-9, inputs)
         no_forces = (0.0,) * len(first)
         loaded = self._plant.load(model, no_forces, inputs, state.temperature_c)
-        responses = strut_responses(self._plant, heights)
-        observers: list[ObserverState] = []
-        longest_gaps_ns: list[int] = []
-        for strut, observer in enumerate(self.observers):
-            measured_ns = first[strut][-1].t_ns if first[strut] else t_ns
-            mobility_per_kg, stiffness_per_s2, damping_per_s = responses[strut]
-            interval_ns, delay_ns = self._sample_timing(strut)
-            if strut in self._untimed:
-                interval_ns = max(interval_ns, _gaps_ns(first[strut])[len(first[strut]) // 2 - 1])
-            longest_gaps_ns.append(observer.longest_gap_ns(interval_ns) + delay_ns)
-            start = Start(
-                measured_ns,
-                mobility_per_kg,
-                interval_ns,
-                delay_ns,
-                stiffness_per_s2,
-                damping_per_s,
-                self._sensors[strut],
-            )
-            before = state.observers
-            observers.append(
-                observer.restart(before[strut], start) if before else observer.init(start)
-            )
+        moves = linearise(self._plant, model, inputs)
+        starts = [
+            self._start_of_strut(strut, first[strut], t_ns, response)
+            for strut, response in enumerate(moves.responses())
+        ]
+        longest_gaps_ns = tuple(
+            observer.longest_gap_ns(start.interval_ns) + start.delay_ns
+            for observer, start in zip(self.observers, starts, strict=True)
+        )
         started = replace(
             state,
-            observers=tuple(observers),
+            observers=self._observers.init(starts, moves, state.observers),
             model=loaded,
-            longest_gaps_ns=tuple(longest_gaps_ns),
+            longest_gaps_ns=longest_gaps_ns,
             bands=state.bands or (InnovationBand(),) * len(first),
-            decoupling=decouple(self._plant, self.observers, heights),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, no_forces, self._newest_ns(state))
+
+    def _start_of_strut(
+        self, strut: int, samples: Sequence[Sample], t_ns: int, response: StrutResponse
+    ) -> Start:
+        """What the observer of a strut is given that starts after some measurements."""
+        interval_ns, delay_ns = self._sample_timing(strut)
+        if strut in self._untimed:
+            interval_ns = max(interval_ns, _gaps_ns(samples)[len(samples) // 2 - 1])
+        measured_ns = samples[-1].t_ns if samples else t_ns
+        mobility, stiffness, damping = response
+        sensors = self._sensors[strut]
+        return Start(measured_ns, mobility, interval_ns, delay_ns, stiffness, damping, sensors)
 
     def _sample_timing(self, strut: int) -> tuple[int, int]:
         """Interval and delay of a strut's heights in ns; zero where none is measured."""
@@ -372,13 +368,14 @@ class FreeModelEstimator:
                 forces_n = self._plant.load(model, no_forces, inputs, temperature_c).forces_n
             instants = self._recent_instants(state, loaded, Instant(t_ns, model.struts, forces_n))
             further = self._compare(readings, instants)
-        observers: list[ObserverState] = []
-        virtual_n: list[float] = []
+        innovations: list[Innovation | None] = []
         bands: list[InnovationBand] = []
-        oldest_ns = t_ns
-        known = self._with_slopes(state.observers, model, inputs, temperature_c)
         for strut, observer in enumerate(self.observers):
-            measured, before, band = received[strut], known[strut], state.bands[strut]
+            measured, before, band = (
+                received[strut],
+                state.observers.struts[strut],
+                state.bands[strut],
+            )
             innovation = None
             # A height that no observer uses is logged alone: what its model errs by stays.
             if measured is not None and observer.requires_height:
@@ -396,24 +393,25 @@ class FreeModelEstimator:
                 band = update_band(band, height_m, innovation_m, measured_ns, sensing, is_settled)
                 if band.is_left and not was_left:
                     return self._begin_again(state, step_input, strut, band)
-            if further:
-                observed = observer.step(before, t_ns, innovation, further[strut])
-            else:
-                observed = observer.step(before, t_ns, innovation)
             bands.append(band)
-            observers.append(observed)
+            innovations.append(innovation)
+        known = state.observers
+        slopes = self._plant.slopes(model, inputs, temperature_c)
+        if slopes is not None:
+            known = self._observers.with_slopes(known, slopes)
+        observers = self._observers.step(known, t_ns, innovations, further)
+        virtual_n: list[float] = []
+        oldest_ns = t_ns
+        for observed in observers.struts:
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
-        if state.decoupling:
-            law_errors_n = [observed.law_error_n for observed in observers]
-            virtual_n = self._limit(combine(state.decoupling, virtual_n, law_errors_n))
         loaded = self._plant.load(model, virtual_n, inputs, temperature_c)
         oldest_ns = self._newest_input_ns(known_inputs, oldest_ns)
         after = FreeModelState(
             t_ns,
             temperature_c,
             (),
-            tuple(observers),
+            observers,
             loaded,
             instants[1:] if instants else state.past,
             state.disturbed_ns,
@@ -421,32 +419,8 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
-            state.decoupling,
         )
         return self._estimate(after, loaded, virtual_n, oldest_ns)
-
-    def _limit(self, forces_n: Sequence[float]) -> list[float]:
-        """Forces within the limits of the struts' observers."""
-        return [
-            min(max(force_n, -observer.force_limit_n), observer.force_limit_n)
-            for force_n, observer in zip(forces_n, self.observers, strict=True)
-        ]
-
-    def _with_slopes(
-        self,
-        states: Sequence[ObserverState],
-        model: ModelState,
-        inputs: Sequence[float],
-        temperature_c: float,
-    ) -> Sequence[ObserverState]:
-        """States of the observers, which know the slopes of the model's laws where it is now."""
-        slopes = self._plant.slopes(model, inputs, temperature_c)
-        if slopes is None:
-            return states
-        return [
-            observer.with_slopes(state, *of_strut)
-            for observer, state, of_strut in zip(self.observers, states, slopes, strict=True)
-        ]
 
     def _begin_again(
         self, state: FreeModelState, step_input: StepInput, strut: int, band: InnovationBand
@@ -466,7 +440,7 @@ class FreeModelEstimator:
         """Whether the model runs, and heights of every strut have come since a time."""
         return (
             state.model is not None
-            and min([observer.measured_ns for observer in state.observers]) > t_ns
+            and min([observer.measured_ns for observer in state.observers.struts]) > t_ns
         )
 
     def _recent_instants(
@@ -509,30 +483,18 @@ class FreeModelEstimator:
         struts: list[StrutOutput] = []
         left_out: tuple[int, ...] = ()
         size = sum(loaded.inputs)
-        is_calm, matrix = state.is_settled, state.decoupling
+        is_calm = state.is_settled
         t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
-        residuals_n: list[float] = []
-        stds_n: list[float] = []
-        if matrix:
-            residuals_n = [observer.residual_force_n for observer in state.observers]
-            stds_n = [observer.force_std_n for observer in state.observers]
-            law_errors_n = [observer.law_error_n for observer in state.observers]
-            residuals_n = combine(matrix, residuals_n, law_errors_n)
-            stds_n = combine_stds(matrix, stds_n)
-        for strut, observer in enumerate(state.observers):
+        for strut, observer in enumerate(state.observers.struts):
             if (
                 observer.is_disturbed
                 or bands[strut].is_left
                 or t_ns - observer.measured_ns > longest_gaps_ns[strut]
-                or (matrix and self._is_at_limit(strut, virtual_n[strut]))
             ):
                 is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]
-            residual_n, std_n = observer.residual_force_n, observer.force_std_n
-            if matrix:
-                residual_n, std_n = residuals_n[strut], stds_n[strut]
-            force_n = law_force_n + residual_n
+            force_n = law_force_n + observer.residual_force_n
             output = StrutOutput(
                 force_n,
                 virtual_n[strut],
@@ -541,7 +503,7 @@ class FreeModelEstimator:
                 velocity_m_per_s,
                 loaded.accelerations_m_per_s2[strut],
                 observer.innovation_m,
-                std_n,
+                observer.force_std_n,
                 law_force_n,
             )
             struts.append(output)
@@ -552,25 +514,19 @@ class FreeModelEstimator:
         # what is not finite has an acceleration of zero there.
         diverged = -1 if is_sensible(size) else find_divergence(struts)
         if not is_calm:
-            state = self._settle(state, virtual_n)
+            state = self._settle(state)
         estimate = Estimate(tuple(struts), measured_ns, state.is_settled, diverged, left_out)
         return state, estimate
 
-    def _is_at_limit(self, strut: int, virtual_force_n: float) -> bool:
-        """Whether a virtual force is at its limit, so that the model cannot follow."""
-        limit_n = self.observers[strut].force_limit_n
-        return limit_n > 0.0 and abs(virtual_force_n) >= limit_n
-
-    def _settle(self, state: FreeModelState, virtual_forces_n: Sequence[float]) -> FreeModelState:
+    def _settle(self, state: FreeModelState) -> FreeModelState:
         """State with the times of the last disturbances, and whether every strut has settled."""
         is_settled, t_ns, disturbed_ns = True, state.t_ns, list(state.disturbed_ns)
         for strut, settling_ns in enumerate(self._settling_ns):
-            observer = state.observers[strut]
+            observer = state.observers.struts[strut]
             if (
                 observer.is_disturbed
                 or state.bands[strut].is_left
                 or t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-                or (bool(state.decoupling) and self._is_at_limit(strut, virtual_forces_n[strut]))
             ):
                 disturbed_ns[strut] = t_ns
                 is_settled = False

@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
-from rig.closed_loop.decoupling import combine, decouple
 from rig.closed_loop.derivatives import central_differences
-from rig.closed_loop.strut_response import (
-    USUAL_SPEED_M_PER_S,
-    StrutResponse,
-    strut_responses,
-)
-from rig.observers.protocol import AnyObserver, Innovation, Observer, ObserverState, Start, StateT
+from rig.closed_loop.strut_response import USUAL_SPEED_M_PER_S, linearise_at
+from rig.observers.error_model import ErrorModel
+from rig.observers.protocol import AnyObserver, Innovation, Start
+from rig.observers.strut_observers import ObserversState, StrutObservers
 
 Array = NDArray[np.float64]
 
@@ -103,8 +100,7 @@ class Loop:
 
     Args:
         heights_m: Strut heights at which the bench is assumed to rest.
-        responses: Responses that the observers take the model to have; by differences on it if
-            absent.
+        assumed: Motion that the observers take the model to have; by differences on it if absent.
     """
 
     def __init__(
@@ -113,28 +109,21 @@ class Loop:
         observers: Sequence[AnyObserver],
         heights_m: Sequence[float],
         timing: SampleTiming,
-        responses: Sequence[StrutResponse] | None = None,
+        assumed: ErrorModel | None = None,
     ) -> None:
-        self._plant, self._observers, self._timing = plant, tuple(observers), timing
+        self._plant, self._observers, self._timing = plant, StrutObservers(observers), timing
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._no_inputs = (0.0,) * plant.inputs
         self._law_n = plant.load(start, [0.0] * plant.struts, self._no_inputs, AMBIENT_C).forces_n
-        self._responses = responses or strut_responses(plant, heights_m)
-        self._decoupling = decouple(plant, observers, heights_m)
-        self._states = [
-            self._steady_state(observer, response)
-            for observer, response in zip(self._observers, self._responses, strict=True)
-        ]
+        self._assumed = assumed or linearise_at(plant, heights_m)
+        self._state = self._steady_state()
         parts = [
             list(plant.numbers(start)),
-            *(
-                list(observer.numbers(state))
-                for observer, state in zip(self._observers, self._states, strict=True)
-            ),
+            self._observers.numbers(self._state),
             self._heights_m * timing.delay,
         ]
-        # Where the numbers of the model, of each observer and of the past heights end.
+        # Where the numbers of the model, of the observers and of the past heights end.
         self._ends = [0, *itertools.accumulate(len(part) for part in parts)]
         self.at_rest: Array = np.array([*itertools.chain(*parts)])
         """Numbers of model, observers and the model's past heights (the newest first), at rest."""
@@ -161,23 +150,16 @@ class Loop:
                 of; those at the start if absent.
         """
         measured_m = self._heights_m if bench_m is None else bench_m
-        parts = [x[first:end].tolist() for first, end in itertools.pairwise(self._ends)]
-        model = self._plant.state_of(parts[0])
-        states = [
-            observer.with_numbers(state, numbers)
-            for observer, state, numbers in zip(
-                self._observers, self._states, parts[1:-1], strict=True
-            )
-        ]
+        numbers, observed, seen = (
+            x[first:end].tolist() for first, end in itertools.pairwise(self._ends)
+        )
+        model = self._plant.state_of(numbers)
+        state = self._observers.with_numbers(self._state, observed)
         if slopes is not None:
-            states = [
-                observer.with_slopes(state, *of_strut)
-                for observer, state, of_strut in zip(self._observers, states, slopes, strict=True)
-            ]
-        timing, seen = self._timing, parts[-1]
-        count = len(self._observers)
+            state = self._observers.with_slopes(state, slopes)
+        timing, count = self._timing, self._plant.struts
         for tick in range(1, timing.measured_every + 1):
-            acting = self._combine(states, [state.virtual_force_n for state in states])
+            acting = [of_strut.virtual_force_n for of_strut in state.struts]
             acting[strut] -= residual_n
             loaded = self._plant.load(model, acting, self._no_inputs, AMBIENT_C)
             model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
@@ -196,28 +178,18 @@ class Loop:
                     )
                 ]
                 seen = (now + seen)[: count * timing.delay]
-            states = [
-                observer.step(state, t_ns, innovation)
-                for observer, state, innovation in zip(
-                    self._observers, states, innovations, strict=True
-                )
-            ]
+            state = self._observers.step(state, t_ns, innovations)
         law_n = self._plant.load(model, [0.0] * count, self._no_inputs, AMBIENT_C).forces_n[strut]
-        residuals_n = self._combine(states, [state.residual_force_n for state in states])
-        error_n = law_n - self._law_n[strut] + residuals_n[strut] - residual_n
-        numbers = [
-            observer.numbers(state) for observer, state in zip(self._observers, states, strict=True)
-        ]
-        return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
-
-    def _combine(self, states: Sequence[ObserverState], forces_n: Sequence[float]) -> list[float]:
-        return combine(self._decoupling, forces_n, [state.law_error_n for state in states])
+        error_n = law_n - self._law_n[strut] + state.struts[strut].residual_force_n - residual_n
+        after = [*self._plant.numbers(model), *self._observers.numbers(state), *seen]
+        return np.array(after), error_n
 
     def linear(self, strut: int = 0, speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> LinearLoop:
         """The loop about a motion at a speed, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
-        step_n = _ACCELERATION_STEP_M_PER_S2 / self._responses[strut].mobility_per_kg
+        mobility_per_kg = float(self._assumed.mobility_per_kg[strut, strut])
+        step_n = _ACCELERATION_STEP_M_PER_S2 / mobility_per_kg
 
         def slopes_at(velocity_m_per_s: float) -> Array:
             moving, bench_m = self._moving(velocity_m_per_s)
@@ -255,19 +227,20 @@ class Loop:
             model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
         return moving, [height_m for height_m, _ in model.struts]
 
-    def _steady_state(self, observer: Observer[StateT], response: StrutResponse) -> StateT:
-        """An observer that has followed a bench at rest for long, its last tick at time zero."""
-        timing = self._timing
+    def _steady_state(self) -> ObserversState:
+        """Observers that have followed a bench at rest for long, their last tick at time zero."""
+        timing, observers = self._timing, self._observers
         delay_ns, ticks = timing.delay * timing.interval_ns, timing.delay + 2
         begin_ns = -ticks * timing.interval_ns
-        mobility, stiffness, damping = response
-        start = Start(
-            begin_ns - delay_ns, mobility, timing.interval_ns, delay_ns, stiffness, damping
-        )
-        state = observer.steady_state(start)
+        starts = [
+            Start(begin_ns - delay_ns, mobility, timing.interval_ns, delay_ns, stiffness, damping)
+            for mobility, stiffness, damping in self._assumed.responses()
+        ]
+        state = observers.steady_state(starts, self._assumed)
+        none = [None] * len(starts)
         for number in range(1 - ticks, 1):
             for tick in range(1 - timing.measured_every, 1):
                 t_ns = number * timing.interval_ns + tick * timing.period_ns
-                innovation = Innovation(0.0, t_ns - delay_ns) if tick == 0 else None
-                state = observer.step(state, t_ns, innovation)
+                seen = [Innovation(0.0, t_ns - delay_ns)] * len(starts)
+                state = observers.step(state, t_ns, seen if tick == 0 else none)
         return state

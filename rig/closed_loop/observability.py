@@ -138,12 +138,16 @@ def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs:
 
 
 def find_corrected(
-    plant: AnyPlant, reader: AnySensorReader, heights_m: Sequence[float], measured: Sequence[int]
+    plant: AnyPlant,
+    reader: AnySensorReader,
+    heights_m: Sequence[float],
+    measured: Sequence[int],
+    observed: Sequence[int],
 ) -> list[bool]:
     """Whether each sensor of a model is determined by what is measured, about rest at some heights.
 
     It is where heights and rates of the measured struts, given by index, determine it, and where no
-    force in another strut changes it.
+    force changes it but those of the observed struts.
     """
     start = np.array(plant.numbers(plant.init(heights_m)))
     no_inputs, no_forces = (0.0,) * plant.inputs, (0.0,) * plant.struts
@@ -165,7 +169,7 @@ def find_corrected(
     left = rows - np.linalg.lstsq(seen.T, rows.T, rcond=None)[0].T @ seen
     loaded = plant.load(plant.init(heights_m), no_forces, no_inputs, AMBIENT_C)
     gains = np.array(reader.force_gains(loaded))
-    others = [strut for strut in range(plant.struts) if strut not in measured]
+    others = [strut for strut in range(plant.struts) if strut not in observed]
     size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
     is_seen = np.linalg.norm(left, axis=1) < _SEEN * size
     largest = np.maximum(np.abs(gains).max(axis=1), 1e-300)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.loop import Loop, SampleTiming
-from rig.closed_loop.strut_response import StrutResponse
+from rig.observers.error_model import ErrorModel
 from rig.observers.protocol import AnyObserver
 
 
@@ -46,17 +46,17 @@ def least_damping(
     plant: AnyPlant,
     observers: Sequence[AnyObserver],
     timing: SampleTiming,
-    responses: Sequence[StrutResponse],
+    assumed: ErrorModel,
     points: Sequence[OperatingPoint],
 ) -> tuple[float, OperatingPoint | None]:
     """The least damping ratio of a loop at several points, and that point; 1 without a point.
 
-    The observers take the model to have the same responses everywhere; its stops and the knees of
-    its damper are in the model alone. A ratio below zero is an error that grows.
+    The observers take the model to move in the same way everywhere; its stops and the knees of its
+    damper are in the model alone. A ratio below zero is an error that grows.
     """
     least: tuple[float, OperatingPoint | None] = 1.0, None
     for point in points:
-        loop = Loop(plant, observers, point.heights_m, timing, responses)
+        loop = Loop(plant, observers, point.heights_m, timing, assumed)
         poles = poles_of(loop.linear(0, point.speed_m_per_s).a, timing.interval_ns * 1e-9)
         ratio = least_damping_ratio(poles)
         if ratio < least[0]:

@@ -40,7 +40,7 @@ def settling_times_ns(
     """Settling time of each strut's estimate, about rest at some heights; None if it never does."""
     loop = Loop(plant, observers, heights_m, timing)
     decays_ns = [
-        decay_time_ns(loop.linear(strut)) if observer.requires_height else 0
+        decay_time_ns(loop.linear(strut)) if observer.estimates_force else 0
         for strut, observer in enumerate(observers)
     ]
     return [

@@ -1,14 +1,16 @@
-"""Responses of a model's struts at rest, by secants of its accelerations."""
+"""Responses of a model and of its struts about a state, by secants."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
-from dart_model.protocol import AnyPlant
+from dart_model.protocol import AnyPlant, ModelState
 from rig.closed_loop.derivatives import central_differences
+from rig.observers.error_model import ErrorModel
+
+Array = NDArray[np.float64]
 
 _SECANT_M, USUAL_SPEED_M_PER_S = 2e-3, 0.1
 """Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
@@ -24,55 +26,57 @@ _SPEEDS_M_PER_S = np.geomspace(0.05, 10.0, 24)
 _SECANT_N = 1.0
 """Of the force, to which the response is linear."""
 
+_SHORT_S = 1e-8
+"""Time in which rates show their accelerations: what the fastest model changes meanwhile is a
+ten-millionth, and what is rounded even less."""
+
 _ROUNDING_N = 1e-6
 """Force that counts as none."""
 
 
-class StrutResponse(NamedTuple):
-    """Response of the acceleration of a strut's height to that strut alone.
+def linearise(plant: AnyPlant, state: ModelState, inputs: Sequence[float]) -> ErrorModel:
+    """Motion of a model about rest where a state has it, by secants of its laws."""
+    at = np.array(plant.numbers(state))
+    n, struts = (len(at) - plant.internal_states) // 2, plant.struts
+    at[n:] = 0.0
+    no_forces = np.zeros(struts)
 
-    It falls by stiffness and damping per metre of height and per metre per second.
-    """
+    def respond(change: Array, forces_n: Array) -> Array:
+        """Heights, accelerations of the coordinates and forces of the laws after a change."""
+        numbers = at.copy()
+        numbers[: 2 * n] += change
+        changed = plant.state_of(numbers.tolist(), 0.0, inputs)
+        loaded = plant.load(changed, forces_n.tolist(), inputs, AMBIENT_C)
+        soon = np.array(plant.numbers(plant.step(loaded, _SHORT_S, inputs)))
+        rates = (soon[n : 2 * n] - numbers[n : 2 * n]) / _SHORT_S
+        heights_m = [height_m for height_m, _ in changed.struts]
+        return np.concatenate([heights_m, rates, loaded.forces_n])
 
-    mobility_per_kg: float
-    stiffness_per_s2: float
-    damping_per_s: float
+    def split(response: Array) -> list[Array]:
+        return np.split(response, [struts, struts + n])
+
+    slightly = [_SECANT_M] * n
+    heights, _, _ = split(
+        central_differences(lambda u: respond(_motion(u, n), no_forces), slightly)
+    )
+    # A coordinate that turns a long arm by a small angle moves a strut as far as one that slides.
+    largest = np.abs(heights).max(axis=0, initial=0.0)
+    reach = np.where(largest > 0.0, largest, 1.0)
+    widths = np.concatenate([_SECANT_M / reach, USUAL_SPEED_M_PER_S / reach]).tolist()
+    _, motion, laws = split(central_differences(lambda u: respond(u, no_forces), widths))
+    _, by_force, _ = split(
+        central_differences(lambda u: respond(np.zeros(2 * n), u), [_SECANT_N] * struts)
+    )
+    return ErrorModel(motion - by_force @ laws, laws, by_force, heights)
 
 
-def strut_responses(plant: AnyPlant, heights_m: Sequence[float]) -> list[StrutResponse]:
-    """Responses of a model's struts at rest at some heights."""
-    return [_strut_response(plant, np.asarray(heights_m), index) for index in range(plant.struts)]
+def _motion(positions: Array, n: int) -> Array:
+    return np.concatenate([positions, np.zeros(n)])
 
 
-def mobility_matrix(plant: AnyPlant, heights_m: Sequence[float]) -> NDArray[np.float64]:
-    """Acceleration of each strut's height per newton in each strut, in 1/kg, (struts, struts).
-
-    At rest at some heights; NaN for a strut that stands where the others put it.
-    """
-    state, no_inputs = plant.init(heights_m), (0.0,) * plant.inputs
-
-    def accelerations(forces_n: NDArray[np.float64]) -> NDArray[np.float64]:
-        loaded = plant.load(state, forces_n.tolist(), no_inputs, AMBIENT_C)
-        return np.array(loaded.accelerations_m_per_s2)
-
-    free = accelerations(np.zeros(plant.struts))
-    return np.column_stack([accelerations(unit) - free for unit in np.eye(plant.struts)])
-
-
-def _strut_response(plant: AnyPlant, heights_m: NDArray[np.float64], index: int) -> StrutResponse:
-    alone, no_inputs = np.eye(plant.struts)[index], (0.0,) * plant.inputs
-
-    def acceleration(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        force_n, height_m, velocity_m_per_s = u.tolist()
-        heights, velocities = heights_m + height_m * alone, velocity_m_per_s * alone
-        state = plant.init(heights.tolist(), velocities.tolist())
-        loaded = plant.load(state, (force_n * alone).tolist(), no_inputs, AMBIENT_C)
-        return np.array([loaded.accelerations_m_per_s2[index]])
-
-    ((mobility, stiffness, damping),) = central_differences(
-        acceleration, (_SECANT_N, _SECANT_M, USUAL_SPEED_M_PER_S)
-    ).tolist()
-    return StrutResponse(mobility, -stiffness, -damping)
+def linearise_at(plant: AnyPlant, heights_m: Sequence[float]) -> ErrorModel:
+    """Motion of a model about rest at some heights, without inputs."""
+    return linearise(plant, plant.init(heights_m), (0.0,) * plant.inputs)
 
 
 def find_driving_speeds_m_per_s(plant: AnyPlant, heights_m: Sequence[float]) -> list[float | None]:

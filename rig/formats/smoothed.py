@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
-from rig.closed_loop.strut_response import mobility_matrix
+from rig.closed_loop.strut_response import linearise_at
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import RunFolder, read_run
 from rig.plan.build import build_plant
@@ -149,7 +149,8 @@ def _mobility(run: RunFolder, plan: Plan) -> Array:
             f"{run.folder}: model {plan.model.name}: smoothing requires a model whose masses move "
             "along straight guides"
         )
-    mobility = mobility_matrix(plant, [strut.free_length_m for strut in plan.struts])
+    rest_m = [strut.free_length_m for strut in plan.struts]
+    mobility = linearise_at(plant, rest_m).mobility_per_kg
     singular = np.linalg.svd(mobility, compute_uv=False)
     if singular[-1] < _SINGULAR * singular[0]:
         raise InputError(f"{run.folder}: model {plan.model.name}: more struts than coordinates")

@@ -28,7 +28,7 @@ References:
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -36,9 +36,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
-from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.yaml_file import Finite
+from rig.observers.covariances import discretise, limit_ahead
 from rig.observers.filter_lag import (
     NO_LAG,
     Lag,
@@ -60,25 +60,25 @@ four the reference case's force error is 2.7 or 1.05 % of the peak at its best b
 _SETTLED = 1e-6
 """Relative distance of the variances from their limit below which the gains are constant."""
 
-_STEADY_VARIANCE = 1.5**2
+STEADY_VARIANCE = 1.5**2
 """Variance of the residual force, over that with every measurement there, up to which the filter is
 steady: single missing ones do no harm."""
 
 _SETTLING = 8.0
 """Time in units of 1 / omega in which a steady filter forgets what it was before."""
 
-_MOST_DOUBLINGS = 60
-"""Of the recursion for the limit: more updates than any run has."""
-
-_ACCELERATION_STD_M_PER_S2 = 30.0
+ACCELERATION_STD_M_PER_S2 = 30.0
 """Of the residual force over the mass, before anything was measured: three times gravity."""
 
-_RATE_STD_M_PER_S = 1.0
+RATE_STD_M_PER_S = 1.0
 """Of the model's velocity at its start: dampers move at up to two metres a second."""
 
 _LOWEST_HZ, _HIGHEST_HZ = 0.01, 1e4
 _LEAST_STD_M, _LARGEST_STD_M = 1e-12, 1.0
 """Bounds of what a filter can be asked for."""
+
+HeightNoise = Annotated[Finite, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
+"""Standard deviation of a height in m."""
 
 _NO_ERROR: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -86,14 +86,14 @@ _FORGOTTEN = 20.0
 """Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
 polynomial of third order is 20³ times as uncertain as at one."""
 
-_MOST_HELD = 20
+MOST_HELD = 20
 """Missing measurements for which an innovation stands in the derivatives that show a lag."""
 
-_STEP_OF_MODEL = 0.5
+STEP_OF_MODEL = 0.5
 """Of a step of the mean, in radians or time constants of the model's own law: a ten-thousandth of
 its change is left out."""
 
-_MOST_OF_MODEL = 50.0
+MOST_OF_MODEL = 50.0
 """The same of a whole step: of a stop that stiff, all that counts is that the error is gone."""
 
 _FADING_S = 1.0
@@ -110,7 +110,7 @@ _WIDEST_OF_RATE = 1.0 / 3.0
 """Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
 
 
-_CONTRADICTION = 8.0**2
+CONTRADICTION = 8.0**2
 """Square of what is new in a measurement behind a gap over its variance, from which it contradicts
 what is known: another zero, or a motion that the gap hid. Once in 1e15 for normal errors."""
 
@@ -193,7 +193,7 @@ class ErrorFilter:
     """
 
     bandwidth_hz: Annotated[Finite, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]
-    noise_std_m: Annotated[Finite, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
+    noise_std_m: HeightNoise
 
     @classmethod
     def within(cls, bandwidth_hz: float, noise_std_m: float) -> "ErrorFilter":
@@ -253,13 +253,13 @@ class ErrorFilter:
         covariance, constants, pace = state.covariance, state.constants, self.pace(state.start)
         if covariance is not None:
             variance = _ahead(covariance, pace, 0)
-            if variance > _STEADY_VARIANCE * constants.steady.residual:
+            if variance > STEADY_VARIANCE * constants.steady.residual:
                 return False
         if t_ns - state.t_ns < constants.next_ns:
             return True
         number = round((t_ns - state.t_ns) / state.start.interval_ns)
         usual = _steady_ahead(pace, 1)
-        return number < 2 or _steady_ahead(pace, number) <= _STEADY_VARIANCE * usual
+        return number < 2 or _steady_ahead(pace, number) <= STEADY_VARIANCE * usual
 
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
@@ -287,7 +287,7 @@ class ErrorFilter:
         are_missing = elapsed_ns >= constants.next_ns
         if covariance is None and not are_missing:
             gain = constants.gain
-            scale = update_scale(constants, scale, new_m * new_m / constants.innovation_m2)
+            scale = update_scale(scale, constants.fading, new_m * new_m / constants.innovation_m2)
             lag = update_lag(lag, constants.lag, new_m)
         else:
             steady = constants.steady.covariance
@@ -297,9 +297,9 @@ class ErrorFilter:
             # As large as it would be were the filter steady.
             share = math.sqrt(constants.steady.innovation / (float(ahead[0, 0]) + 1.0))
             usual_m2 = scale * constants.innovation_m2
-            if are_missing and (share * new_m) ** 2 > _CONTRADICTION * usual_m2:
+            if are_missing and (share * new_m) ** 2 > CONTRADICTION * usual_m2:
                 return self.restart(state, innovation)
-            for _ in range(min(number, _MOST_HELD)):
+            for _ in range(min(number, MOST_HELD)):
                 lag = update_lag(lag, constants.lag, share * new_m)
             in_units, covariance = _gain(ahead)
             gain = in_si(in_units, constants.omega)
@@ -399,7 +399,7 @@ class ErrorFilter:
             gain,
             steady.innovation * variance_m2,
             math.sqrt(max(steady.residual, 0.0) * variance_m2) * omega**2,
-            min(1.0, interval_ns * 1e-9 / _FADING_S),
+            scale_fading(interval_ns),
             omega,
             (3 * interval_ns + 1) // 2,
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
@@ -419,8 +419,8 @@ class ErrorFilter:
     def _prior(self) -> Array:
         """Covariance before anything was measured."""
         omega, sigma = self.omega, self.noise_std_m
-        rate = _RATE_STD_M_PER_S / (sigma * omega)
-        acceleration = _ACCELERATION_STD_M_PER_S2 / (sigma * omega**2)
+        rate = RATE_STD_M_PER_S / (sigma * omega)
+        acceleration = ACCELERATION_STD_M_PER_S2 / (sigma * omega**2)
         return np.diag(np.array([1.0, rate, acceleration, acceleration, acceleration]) ** 2)
 
 
@@ -432,13 +432,21 @@ class Pace(NamedTuple):
     damping: float = 0.0
 
 
-def update_scale(constants: Constants, scale: float, squared: float) -> float:
+def scale_fading(interval_ns: int) -> float:
+    """Share of the newest of measurements at an interval in the variances' scale."""
+    return min(1.0, interval_ns * 1e-9 / _FADING_S)
+
+
+def update_scale(scale: float, fading: float, squared: float) -> float:
     """The variances' scale after a measurement.
 
-    `squared` is the square of what is new in the measurement over its variance, one on average
-    where the variances are right.
+    Args:
+        scale: The scale before.
+        fading: Share of this measurement.
+        squared: Square of what is new in it over its variance, one on average where the variances
+            are right.
     """
-    scale += constants.fading * (squared - scale)
+    scale += fading * (squared - scale)
     return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
 
 
@@ -455,7 +463,12 @@ def in_si(gain: Array, omega: float) -> Mean:
     return x, v, a, j, s
 
 
-def inputs_since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
+InputT = TypeVar("InputT")
+
+
+def inputs_since(
+    inputs: tuple[tuple[int, InputT], ...], t_ns: int
+) -> tuple[tuple[int, InputT], ...]:
     """Those inputs that still act at a time or begin after it."""
     first = 0
     while first + 1 < len(inputs) and inputs[first + 1][0] <= t_ns:
@@ -479,11 +492,11 @@ def mean_at(state: ErrorState, to_ns: int) -> Mean:
         h = (end_ns - from_ns) * 1e-9
         from_ns = end_ns
         # A step in which the model itself hardly moves: what its law does is a Taylor series.
-        quick = min(h * own_per_s, _MOST_OF_MODEL)
-        if quick <= _STEP_OF_MODEL:
+        quick = min(h * own_per_s, MOST_OF_MODEL)
+        if quick <= STEP_OF_MODEL:
             mean = _taylor_step(mean, by_force, h, slopes)
             continue
-        count = math.ceil(quick / _STEP_OF_MODEL)
+        count = math.ceil(quick / STEP_OF_MODEL)
         for _ in range(count):
             mean = _taylor_step(mean, by_force, h / count, slopes)
     return mean
@@ -529,48 +542,21 @@ def _ahead(covariance: Array, pace: Pace, number: int) -> float:
 
 @lru_cache(maxsize=1024)
 def _transition(time: float, stiffness: float, damping: float) -> tuple[Array, Array]:
-    """Transition over a time, and covariance of what unit white noise adds meanwhile.
-
-    Reference: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978).
-    """
-    # Van Loan's matrix grows where the model's own motion decays: a short time, doubled.
-    doublings = max(0, math.ceil(math.log2(max(time * (damping + math.sqrt(abs(stiffness))), 1.0))))
-    short = time / 2**doublings
+    """Transition over a time, and covariance of what unit white noise adds meanwhile."""
     rates = np.diag(np.ones(ORDER - 1), 1)
     rates[1, :2] = -stiffness, -damping
     driven = np.zeros((ORDER, ORDER))
     driven[-1, -1] = 1.0
-    generator: Array = short * np.block([[-rates, driven], [np.zeros((5, 5)), rates.T]])
-    both = expm(generator)
-    transition = np.ascontiguousarray(both[ORDER:, ORDER:].T)
-    noise = transition @ both[:ORDER, ORDER:]
-    for _ in range(doublings):
-        noise = noise + transition @ noise @ transition.T
-        transition = transition @ transition
-    return transition, 0.5 * (noise + noise.T)
+    return discretise(rates, driven, time, damping + math.sqrt(abs(stiffness)))
 
 
 @lru_cache(maxsize=256)
 def _steady(pace: Pace) -> Steady:
-    """The limit of the filter's recursion, by doubling its length in each iteration.
-
-    Reference: Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
-    algebraic Riccati equations, Int. J. Control 77 (2004).
-    """
+    """The limit of the filter's recursion."""
     transition, noise = _transition(pace.interval, pace.stiffness, pace.damping)
-    a, g, ahead = transition.T, np.zeros((ORDER, ORDER)), pace.interval * noise
-    g[0, 0] = 1.0
-    for _ in range(_MOST_DOUBLINGS):
-        between = np.linalg.inv(np.eye(ORDER) + g @ ahead)
-        before = ahead
-        ahead = ahead + a.T @ ahead @ between @ a
-        ahead = 0.5 * (ahead + ahead.T)
-        g = g + a @ between @ g @ a.T
-        g = 0.5 * (g + g.T)
-        a = a @ between @ a
-        change = np.abs(np.diagonal(ahead) - np.diagonal(before))
-        if np.all(change <= 1e-12 * np.diagonal(ahead)):
-            break
+    information = np.zeros((ORDER, ORDER))
+    information[0, 0] = 1.0
+    ahead = limit_ahead(transition, pace.interval * noise, information)
     gain, after = _gain(ahead)
     return Steady(gain, float(ahead[0, 0]) + 1.0, after, _ahead(after, pace, 0))
 

@@ -21,18 +21,21 @@ Reference: Mehra, "On the identification of variances and adaptive Kalman filter
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import (  # pyright: ignore[reportUnknownVariableType, reportMissingTypeStubs]
     expm,
     solve_discrete_lyapunov,
 )
 
+Array = NDArray[np.float64]
+
 _CORNER = 1.5
 """Corner of the derivatives over that of the filter."""
 
-_FADING = 20.0
+FADING = 20.0
 """Time constant with which their square is followed, in units of 1 / omega."""
 
-_LARGEST_OF_NOISE = 9.0
+LARGEST_OF_NOISE = 9.0
 """Square that white innovations hardly ever show, over its mean: three standard deviations."""
 
 
@@ -65,21 +68,31 @@ class LagFilter(NamedTuple):
     fading: float
 
 
-def make_lag_filter(
-    omega: float, interval_s: float, gain: tuple[float, float], innovation_m2: float
-) -> LagFilter:
-    """The filter for innovations of a variance, with a gain in SI (of error, and of its rate)."""
+def derivatives_filter(omega: float, interval_s: float) -> tuple[Array, Array, Array]:
+    """Filter of an innovation and of two derivatives, for a force with a corner in rad/s.
+
+    The result is its transition over an interval, (3, 3), the share of the innovation, (3,), and
+    the units of value, rate and curvature, (3,).
+    """
     corner = _CORNER * omega
     # In units of 1 / corner, where the numbers are of one size.
     rates = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [-1, -2, -2, 1], [0, 0, 0, 0]])
     step = expm(rates * (corner * interval_s))
-    units = corner ** np.arange(3)
+    return step[:3, :3], step[:3, 3], np.power(corner, np.arange(3.0))
+
+
+def make_lag_filter(
+    omega: float, interval_s: float, gain: tuple[float, float], innovation_m2: float
+) -> LagFilter:
+    """The filter for innovations of a variance, with a gain in SI (of error, and of its rate)."""
+    transition, share, units = derivatives_filter(omega, interval_s)
     output = np.array([gain[1] / interval_s, gain[0] / interval_s, 1.0]) * units
-    transition, share = step[:3, :3], step[:3, 3]
     covariance = solve_discrete_lyapunov(transition, np.outer(share, share) * innovation_m2)
     white = float(output @ covariance @ output)
-    rows = tuple(tuple(row) for row in step[:3].tolist())
-    return LagFilter(rows, tuple(output.tolist()), white, min(1.0, omega * interval_s / _FADING))
+    rows = tuple(
+        (a, b, c, d) for (a, b, c), d in zip(transition.tolist(), share.tolist(), strict=True)
+    )
+    return LagFilter(rows, tuple(output.tolist()), white, min(1.0, omega * interval_s / FADING))
 
 
 def update_lag(lag: Lag, filtered: LagFilter, new_m: float) -> Lag:
@@ -100,4 +113,4 @@ def update_lag(lag: Lag, filtered: LagFilter, new_m: float) -> Lag:
 def lag_variance(lag: Lag, filtered: LagFilter, scale: float) -> float:
     """Variance of the lag in m²/s⁴, beyond what innovations of a scaled variance show."""
     white = scale * filtered.white
-    return max(0.0, lag.square - white, lag.peak - _LARGEST_OF_NOISE * white)
+    return max(0.0, lag.square - white, lag.peak - LARGEST_OF_NOISE * white)

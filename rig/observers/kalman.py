@@ -27,6 +27,7 @@ from pydantic.dataclasses import dataclass
 from can_dbc.yaml_file import Positive
 from rig.observers.error_filter import ErrorFilter, ErrorState
 from rig.observers.filter_lag import NO_LAG
+from rig.observers.joint_model import ObservedStrut
 from rig.observers.protocol import (
     AnyObserver,
     Innovation,
@@ -36,12 +37,6 @@ from rig.observers.protocol import (
     Start,
     TuningTask,
     Vector,
-)
-from rig.observers.sensor_fusion import (
-    FusionMemory,
-    fuse_samples,
-    initial_memory,
-    restart_memory,
 )
 
 _DAMPING = 0.8
@@ -69,7 +64,7 @@ _UNTUNED_CORNER_PER_INTERVAL = 0.1
 
 
 class KalmanState(Struct, frozen=True, gc=False):
-    """State of a noise-aware observer; `fusion` is None without further sensors."""
+    """State of a noise-aware observer of a strut that it observes alone."""
 
     error: ErrorState
     innovation_m: float
@@ -77,14 +72,12 @@ class KalmanState(Struct, frozen=True, gc=False):
     residual_force_n: float
     force_std_n: float
     measured_ns: int
-    fusion: FusionMemory | None = None
     is_disturbed: bool = False
-    law_error_n: float = 0.0
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Channels of further sensors that are not used now."""
-        return () if self.fusion is None else self.fusion.left_out
+        """None: a strut with further sensors has a joint filter."""
+        return ()
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -97,30 +90,46 @@ class KalmanObserver:
         force_limit_n: Largest magnitude of the virtual force.
     """
 
-    requires_height: ClassVar[bool] = True
     fuses_sensors: ClassVar[bool] = True
-    asks_for_acceleration: ClassVar[bool] = True
+    is_joinable: ClassVar[bool] = True
     knows_std: ClassVar[bool] = True
+    estimates_force: ClassVar[bool] = True
 
     kind: Literal["kalman"]
     filter: ErrorFilter
     force_limit_n: Positive = 1.0e4
 
     @property
+    def requires_height(self) -> bool:
+        return True
+
+    @property
     def measurements_to_start(self) -> int:
         """Enough for height and velocity: a parabola through twelve of them."""
         return 12
+
+    @property
+    def height_std_m(self) -> float:
+        return self.filter.noise_std_m
+
+    def observed(self, strut: int, start: Start) -> ObservedStrut:
+        """The strut of an index, as a joint filter observes it."""
+        corner = self._corner(start)
+        return ObservedStrut(strut, self.filter, self.force_limit_n, corner, _DAMPING)
+
+    def _corner(self, start: Start) -> float:
+        """Corner of the feedback in rad/s."""
+        return min(self.filter.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
 
     def init(self, start: Start) -> KalmanState:
         return self._initial(self.filter.init(start), start)
 
     def restart(self, state: KalmanState, start: Start) -> KalmanState:
-        """The state of a start, with the lag there was and the health of the further sensors."""
+        """The state of a start, with the lag there was."""
         begun = self.init(start)
         lag = NO_LAG._replace(square=state.error.lag.square, peak=state.error.lag.peak)
         error = structs.replace(begun.error, lag=lag)
-        fusion = None if state.fusion is None else restart_memory(state.fusion, start)
-        return structs.replace(begun, error=error, fusion=fusion)
+        return structs.replace(begun, error=error)
 
     def steady_state(self, start: Start) -> KalmanState:
         return self._initial(self.filter.steady_state(start), start)
@@ -129,32 +138,21 @@ class KalmanObserver:
         std_n = self.filter.residual_std(error, start.t_ns) / start.mobility_per_kg
         return KalmanState(error, 0.0, 0.0, 0.0, std_n, start.t_ns)
 
-    def step(
-        self,
-        state: KalmanState,
-        t_ns: int,
-        innovation: Innovation | None,
-        further: Sequence[Innovation] = (),
-    ) -> KalmanState:
-        error, fusion = state.error, state.fusion
-        if error.start.sensors:
-            memory = fusion or initial_memory(error.start)
-            error, fusion = fuse_samples(self.filter, error, memory, t_ns, innovation, further)
-        elif innovation is not None:
+    def step(self, state: KalmanState, t_ns: int, innovation: Innovation | None) -> KalmanState:
+        error = state.error
+        if innovation is not None:
             error = self.filter.update(error, innovation)
         innovation_m = state.innovation_m if innovation is None else innovation.value
         start, follower, limit_n = error.start, self.filter, self.force_limit_n
         mobility_per_kg = start.mobility_per_kg
         mean = follower.predict(error, t_ns)
         x, v, a, _, _ = mean
-        corner = min(error.constants.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
+        corner = self._corner(start)
         required = a + corner * corner * x + 2.0 * _DAMPING * corner * v
         force_n = min(max(required / mobility_per_kg, -limit_n), limit_n)
         std_n = follower.residual_std(error, t_ns) / mobility_per_kg
         residual_n = follower.residual(error, mean) / mobility_per_kg
-        law_error_n = a / mobility_per_kg - residual_n
         error = follower.with_input(error, t_ns, -force_n * mobility_per_kg)
-        measured_ns = error.t_ns if fusion is None else fusion.measured_ns
         is_disturbed = abs(force_n) >= limit_n or not follower.is_steady(error, t_ns)
         return KalmanState(
             error,
@@ -162,10 +160,8 @@ class KalmanObserver:
             force_n,
             residual_n,
             std_n,
-            measured_ns,
-            fusion,
+            error.t_ns,
             is_disturbed,
-            law_error_n,
         )
 
     def with_slopes(
@@ -191,12 +187,9 @@ class KalmanObserver:
 
     def with_numbers(self, state: KalmanState, numbers: Sequence[float]) -> KalmanState:
         error = self.filter.with_numbers(state.error, numbers)
-        now_ns, by_force = error.inputs[-1]
-        mean, per_kg = self.filter.predict(error, now_ns), error.start.mobility_per_kg
-        law_error_n = (mean[2] - self.filter.residual(error, mean)) / per_kg
-        return structs.replace(
-            state, error=error, virtual_force_n=-by_force / per_kg, law_error_n=law_error_n
-        )
+        _, by_force = error.inputs[-1]
+        virtual_force_n = -by_force / error.start.mobility_per_kg
+        return structs.replace(state, error=error, virtual_force_n=virtual_force_n)
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one has the same filter, whose state it continues."""

@@ -1,9 +1,8 @@
 """No observer: the strut's force is that of the model's law.
 
-If its height is measured, it is logged for a diagnosis and corrects nothing.
-
 An example is a tyre under an observed suspension: its law takes part in the motion and is not
-corrected.
+corrected. If its height is measured, it is logged for a diagnosis; where its noise is stated, it
+also shows the filter of the observed struts where the bench is.
 """
 
 import sys
@@ -15,6 +14,7 @@ from msgspec import Struct
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+from rig.observers.error_filter import HeightNoise
 from rig.observers.protocol import AnyObserver, Innovation, Remark, SensorStep, Start
 
 
@@ -25,7 +25,6 @@ class NoState(Struct, frozen=True, gc=False):
     innovation_m: float = nan
     virtual_force_n: float = 0.0
     residual_force_n: float = 0.0
-    law_error_n: float = 0.0
     force_std_n: float = nan
     left_out: tuple[int, ...] = ()
     is_disturbed: bool = False
@@ -37,14 +36,26 @@ class NoObserver:
 
     Attributes:
         kind: `none`: no observer.
+        noise_std_m: Standard deviation of its measured height, quantisation included, with which
+            the height corrects the filter of the struts with observers of the kind `kalman` that it
+            shares bodies with; if absent, no height corrects it.
     """
 
-    requires_height: ClassVar[bool] = False
     fuses_sensors: ClassVar[bool] = False
-    asks_for_acceleration: ClassVar[bool] = False
+    is_joinable: ClassVar[bool] = True
     knows_std: ClassVar[bool] = False
+    estimates_force: ClassVar[bool] = False
 
     kind: Literal["none"]
+    noise_std_m: HeightNoise | None = None
+
+    @property
+    def requires_height(self) -> bool:
+        return self.noise_std_m is not None
+
+    @property
+    def height_std_m(self) -> float | None:
+        return self.noise_std_m
 
     @property
     def force_limit_n(self) -> float:
@@ -53,8 +64,8 @@ class NoObserver:
 
     @property
     def measurements_to_start(self) -> int:
-        """Zero: the model starts where the other heights put the strut."""
-        return 0
+        """As many as others require; without a height the others put the strut where it starts."""
+        return 0 if self.noise_std_m is None else 12
 
     def init(self, start: Start) -> NoState:
         return NoState(start.t_ns)
@@ -66,14 +77,8 @@ class NoObserver:
     def steady_state(self, start: Start) -> NoState:
         return NoState(start.t_ns)
 
-    def step(
-        self,
-        state: NoState,
-        t_ns: int,
-        innovation: Innovation | None,
-        further: Sequence[Innovation] = (),
-    ) -> NoState:
-        del state, innovation, further
+    def step(self, state: NoState, t_ns: int, innovation: Innovation | None) -> NoState:
+        del state, innovation
         return NoState(t_ns)
 
     def with_slopes(

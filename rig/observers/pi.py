@@ -75,10 +75,6 @@ class PiState(Struct, frozen=True, gc=False):
         return self.virtual_force_n
 
     @property
-    def law_error_n(self) -> float:
-        return 0.0
-
-    @property
     def force_std_n(self) -> float:
         return nan
 
@@ -102,10 +98,10 @@ class PiObserver:
             absent, the last innovation is used.
     """
 
-    requires_height: ClassVar[bool] = True
     fuses_sensors: ClassVar[bool] = False
-    asks_for_acceleration: ClassVar[bool] = False
+    is_joinable: ClassVar[bool] = False
     knows_std: ClassVar[bool] = False
+    estimates_force: ClassVar[bool] = True
 
     kind: Literal["pi"] = "pi"
     proportional_n_per_m: NotNegative = 1.0e5
@@ -118,6 +114,14 @@ class PiObserver:
         """Refuse a derivative of the raw innovation: that is noise."""
         if self.derivative_n_s_per_m and self.filter is None:
             raise ValueError(f"derivative_n_s_per_m {self.derivative_n_s_per_m:g}: requires filter")
+
+    @property
+    def requires_height(self) -> bool:
+        return True
+
+    @property
+    def height_std_m(self) -> None:
+        return None
 
     @property
     def measurements_to_start(self) -> int:
@@ -136,15 +140,8 @@ class PiObserver:
         error = None if self.filter is None else self.filter.steady_state(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
-    def step(
-        self,
-        state: PiState,
-        t_ns: int,
-        innovation: Innovation | None,
-        further: Sequence[Innovation] = (),
-    ) -> PiState:
+    def step(self, state: PiState, t_ns: int, innovation: Innovation | None) -> PiState:
         """Between measurements the force is constant; at the limit the integral does not grow."""
-        del further
         if innovation is None:
             return state
         error, innovation_m, rate_m_per_s = state.error, innovation.value, 0.0

@@ -69,15 +69,6 @@ class ObserverState(Protocol):
         ...
 
     @property
-    def law_error_n(self) -> float:
-        """Force by which the model's law errs because the model is not where the bench is.
-
-        Stiffness times the estimated error of the height and damping times that of its rate; 0
-        where the observer does not estimate them.
-        """
-        ...
-
-    @property
     def force_std_n(self) -> float:
         """Standard deviation of that estimate; NaN where the observer does not know it."""
         ...
@@ -120,21 +111,33 @@ StateT = TypeVar("StateT", bound=ObserverState)
 
 
 class Observer(Protocol[StateT]):
-    """What makes the model of one strut follow its bench. It knows no other strut.
+    """What makes the model of one strut follow its bench. By itself it knows no other strut.
 
     The settings of an observer are its own attributes: it is a frozen pydantic dataclass with a
     `kind`, which `rig.observers.OBSERVERS` lists.
 
     Attributes:
-        asks_for_acceleration: Whether its forces stand for accelerations of its height, so that
-            those of several struts have to be decoupled (`rig.closed_loop.decoupling`).
+        fuses_sensors: Whether further sensors of its strut are used.
+        is_joinable: Whether struts that move each other have one filter
+            (`rig.observers.joint_filter`).
         knows_std: Whether it knows the standard deviation of its estimate.
+        estimates_force: Whether it estimates a residual force.
     """
 
-    requires_height: ClassVar[bool]
     fuses_sensors: ClassVar[bool]
-    asks_for_acceleration: ClassVar[bool]
+    is_joinable: ClassVar[bool]
     knows_std: ClassVar[bool]
+    estimates_force: ClassVar[bool]
+
+    @property
+    def requires_height(self) -> bool:
+        """Whether the height of its strut has to be measured."""
+        ...
+
+    @property
+    def height_std_m(self) -> float | None:
+        """Standard deviation of the height in a joint filter; None where it corrects none."""
+        ...
 
     @property
     def kind(self) -> str:
@@ -163,17 +166,10 @@ class Observer(Protocol[StateT]):
         """State after a long time at rest, whose variances no longer change."""
         ...
 
-    def step(
-        self,
-        state: StateT,
-        t_ns: int,
-        innovation: Innovation | None,
-        further: Sequence[Innovation] = (),
-    ) -> StateT:
+    def step(self, state: StateT, t_ns: int, innovation: Innovation | None) -> StateT:
         """State after a tick, from the state after the last one.
 
-        `innovation` is that of a new measurement of the height, None where no frame came; `further`
-        are those of new samples of further sensors.
+        `innovation` is that of a new measurement of the height, None where no frame came.
         """
         ...
 

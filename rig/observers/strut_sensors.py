@@ -9,9 +9,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import FORCE, HEIGHT, VELOCITY, Quantity
-from rig.observers.protocol import Start
+
+Array = NDArray[np.float64]
 
 
 class Instant(NamedTuple):
@@ -27,35 +31,44 @@ class Instant(NamedTuple):
     forces_n: Sequence[float]
 
 
+class StrutErrors(NamedTuple):
+    """Errors of the model of one strut, bench less model, as rows of what a filter estimates.
+
+    Attributes:
+        height: Of the height (m), shape (N,).
+        velocity: Of its rate (m/s).
+        force: Of the strut's force (N): what the model's law lacks where the model is.
+    """
+
+    height: Array
+    velocity: Array
+    force: Array
+
+
 @dataclass(frozen=True)
 class StrutSensor:
     """How a kind of sensor sees the model.
 
     Attributes:
         reading: The model at a time and the index of a strut -> what the sensor reads there, SI.
-        row: Start of the observer -> change of the reading per model error (m), its rate (m/s) and
-            acceleration by the residual force (m/s²).
+        error: Errors of a strut -> that of the reading.
     """
 
     reading: Callable[[Instant, int], float]
-    row: Callable[[Start], tuple[float, float, float]]
-
-
-def _force_row(start: Start) -> tuple[float, float, float]:
-    """The force that the law lacks, m (d/m - k x - c dx/dt)."""
-    mass_kg = 1.0 / start.mobility_per_kg
-    return -start.stiffness_per_s2 * mass_kg, -start.damping_per_s * mass_kg, mass_kg
+    error: Callable[[StrutErrors], Array]
 
 
 STRUT_SENSORS: Mapping[Quantity, StrutSensor] = MappingProxyType(
     {
         HEIGHT: StrutSensor(
-            lambda instant, strut: instant.struts[strut][0], lambda _start: (1.0, 0.0, 0.0)
+            lambda instant, strut: instant.struts[strut][0], lambda errors: errors.height
         ),
         VELOCITY: StrutSensor(
-            lambda instant, strut: instant.struts[strut][1], lambda _start: (0.0, 1.0, 0.0)
+            lambda instant, strut: instant.struts[strut][1], lambda errors: errors.velocity
         ),
-        FORCE: StrutSensor(lambda instant, strut: instant.forces_n[strut], _force_row),
+        FORCE: StrutSensor(
+            lambda instant, strut: instant.forces_n[strut], lambda errors: errors.force
+        ),
     }
 )
 

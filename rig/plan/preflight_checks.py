@@ -25,7 +25,7 @@ from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least
 from rig.closed_loop.strut_response import (
     FAST_SPEED_M_PER_S,
     find_driving_speeds_m_per_s,
-    strut_responses,
+    linearise_at,
 )
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
@@ -124,18 +124,19 @@ def check(plan: Plan) -> list[Finding]:
 def _virtual_sensors(plan: Plan, plant: AnyPlant) -> list[Finding]:
     """Which virtual sensors the measured heights correct."""
     measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
+    observed = [i for i in measured if plan.struts[i].observer.estimates_force]
     of_model = {it.name: it.sensor for it in plan.virtual_sensors if it.strut < 0}
     corrected: dict[str, bool] = {}
     if of_model:
         rest_m = [strut.free_length_m for strut in plan.struts]
         reader = plant.virtual_sensors(of_model)
-        found = find_corrected(plant, reader, rest_m, measured)
+        found = find_corrected(plant, reader, rest_m, measured, observed)
         corrected = dict(zip(of_model, found, strict=True))
     findings: list[Finding] = []
     for item in plan.virtual_sensors:
         is_corrected = corrected.get(item.name, False)
         if item.strut >= 0:
-            is_corrected = item.strut in measured
+            is_corrected = item.strut in observed
         text = (
             "the measured heights correct it"
             if is_corrected
@@ -597,8 +598,8 @@ def _in_motion(plan: Plan, plant: AnyPlant, rest: Sequence[float], timing: Sampl
     ]
     heights = [rest, *((end, *rest[1:]) for end in ends)]
     points = [OperatingPoint(at, FAST_SPEED_M_PER_S) for at in heights]
-    responses = strut_responses(plant, rest)
-    ratio, point = least_damping(plant, plan.observers, timing, responses, points)
+    assumed = linearise_at(plant, rest)
+    ratio, point = least_damping(plant, plan.observers, timing, assumed, points)
     text = f"least damping ratio {ratio:.3f} at {FAST_SPEED_M_PER_S:g} m/s"
     if point is not None and ratio < 0.0:
         text = (
@@ -624,7 +625,7 @@ def _settling(plan: Plan) -> list[Finding]:
         if time_ns is None:
             text = "never: the estimate would not become valid; see the poles, and rig tune"
             findings.append(Finding(Severity.ERROR, subject, text))
-        elif strut.observer.requires_height:
+        elif strut.observer.estimates_force:
             text = f"{time_ns * 1e-9:.2g} s"
             if strut.observer.knows_std:
                 text += " from when the variance that it states has settled"
@@ -646,18 +647,19 @@ def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     names = plan.strut_names
     linear = linear_model(plant, [strut.free_length_m for strut in plan.struts])
     measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
-    forces = [Unknown(f"the residual force of {names[i]}", i) for i in measured]
+    observed = [i for i in measured if plan.struts[i].observer.estimates_force]
+    forces = [Unknown(f"the residual force of {names[i]}", i) for i in observed]
     result = observability(linear, measured, forces)
     hidden = [*(item.name for item in result.hidden), *map(_pair, result.confused)]
     if not hidden and not result.together:
         hidden = ["all of these forces at once, which can be in balance: leave out one observer"]
-    shown = ", ".join(names[i] for i in measured)
+    shown = ", ".join(names[i] for i in observed)
     severity, text = Severity.OK, f"the residual force of {shown} is observable"
     if hidden:
         severity, text = Severity.WARNING, f"not observable from heights: {'; '.join(hidden)}"
     findings = [Finding(severity, "observability", text)]
     confused: list[str] = []
-    for i in measured:
+    for i in observed:
         name = names[i]
         of_strut = (
             Unknown(f"the spring's force of {name}", i),

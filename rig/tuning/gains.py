@@ -24,8 +24,8 @@ from rig.closed_loop.poles import (
     poles_of,
 )
 from rig.closed_loop.settling import decay_time_ns
-from rig.closed_loop.strut_response import StrutResponse
 from rig.observers import OBSERVERS
+from rig.observers.error_model import ErrorModel
 from rig.observers.pi import PUBLISHED_PER_S2
 from rig.observers.protocol import AnyObserver, AnyTunableObserver, TuningTask, Vector
 from rig.tuning.expectation import Expectation
@@ -127,7 +127,7 @@ class TuningProblem(NamedTuple):
     plant: AnyPlant
     observers: tuple[AnyObserver, ...]
     strut: int
-    responses: Sequence[StrutResponse]
+    assumed: ErrorModel
     heights_m: Sequence[float]
     timing: SampleTiming
     expectation: Expectation
@@ -137,7 +137,7 @@ class TuningProblem(NamedTuple):
     @property
     def mobility_per_kg(self) -> float:
         """Acceleration of the strut's height per newton in it."""
-        return self.responses[self.strut].mobility_per_kg
+        return float(self.assumed.mobility_per_kg[self.strut, self.strut])
 
     def linear(self, observer: AnyObserver, factor: float = 1.0) -> LinearLoop:
         """The loop with another observer of this strut.
@@ -148,9 +148,7 @@ class TuningProblem(NamedTuple):
         plant = self.plant
         if factor != 1.0:
             plant = cast("AnyPlant", _StrongerPlant(plant, factor))
-        loop = Loop(
-            plant, self.with_observer(observer), self.heights_m, self.timing, self.responses
-        )
+        loop = Loop(plant, self.with_observer(observer), self.heights_m, self.timing, self.assumed)
         return loop.linear(self.strut)
 
     def with_observer(self, observer: AnyObserver) -> tuple[AnyObserver, ...]:
@@ -160,7 +158,7 @@ class TuningProblem(NamedTuple):
     def damping_in_motion(self, observer: AnyObserver) -> float:
         """Least damping ratio of the loop with another observer, at the operating points."""
         observers = self.with_observer(observer)
-        return least_damping(self.plant, observers, self.timing, self.responses, self.points)[0]
+        return least_damping(self.plant, observers, self.timing, self.assumed, self.points)[0]
 
 
 class _StrongerPlant:

@@ -17,15 +17,11 @@ from dart_model.protocol import AnyPlant
 from rig.channels.channel import Channel
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import OperatingPoint
-from rig.closed_loop.strut_response import (
-    FAST_SPEED_M_PER_S,
-    StrutResponse,
-    mobility_matrix,
-    strut_responses,
-)
+from rig.closed_loop.strut_response import FAST_SPEED_M_PER_S, linearise_at
 from rig.diagnosis.progress import Progress, within
 from rig.files.yaml_edit import edit_keys
 from rig.log.reader import read_run
+from rig.observers.error_model import ErrorModel
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import paper_observer
 from rig.observers.protocol import AnyObserver, AnyTunableObserver
@@ -107,7 +103,7 @@ def tune(
         raise InputError(
             f"{plan.source}: prescribed_motion: no loop is closed, expected a free model"
         )
-    if not all(strut.observer.requires_height for strut in plan.struts):
+    if not all(strut.observer.estimates_force for strut in plan.struts):
         raise InputError(
             f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
             "an observer of each strut"
@@ -119,15 +115,15 @@ def tune(
         )
     plant = build_plant(plan)
     at_rest_m = [strut.free_length_m for strut in plan.struts]
-    responses = strut_responses(plant, at_rest_m)
+    assumed = linearise_at(plant, at_rest_m)
     progress("reading what is to be expected", 0.0)
     steps = read_run(source).steps if isinstance(source, Path) else None
     points = [OperatingPoint(at_rest_m, FAST_SPEED_M_PER_S)]
     if steps is not None:
         points = operating_points(steps, plan.strut_names) or points
-    mobility = mobility_matrix(plant, at_rest_m)
+    mobility = assumed.mobility_per_kg
     expectations = _expectations(plan, source, steps, mobility)
-    loops = _Loops(plan, plant, responses, mobility, points, expectations)
+    loops = _Loops(plan, plant, assumed, mobility, points, expectations)
     if isinstance(source, Path) and (recorded := plan_of_run(source)).model != plan.model:
         progress("the run with this model", 0.0)
         loops = _follow_with_own_model(loops, recorded, source, aim)
@@ -201,7 +197,7 @@ class _Loops(NamedTuple):
     Attributes:
         plan: The configuration.
         plant: Its model.
-        responses: Response of each strut.
+        assumed: Motion that the observers take the model to have.
         mobility_per_kg: Acceleration of each height per newton in each strut, (struts, struts).
         points: Motions in which the loops have to be stable.
         expectations: What the observer of each strut has to expect.
@@ -209,7 +205,7 @@ class _Loops(NamedTuple):
 
     plan: Plan
     plant: AnyPlant
-    responses: Sequence[StrutResponse]
+    assumed: ErrorModel
     mobility_per_kg: Array
     points: Sequence[OperatingPoint]
     expectations: Sequence[Expectation]
@@ -225,7 +221,7 @@ class _Loops(NamedTuple):
             self.plant,
             others,
             index,
-            self.responses,
+            self.assumed,
             [strut.free_length_m for strut in struts],
             SampleTiming.of(self.plan.period_ns, struts[index].interval_ns, round(delay_s * 1e9)),
             self.expectations[index],

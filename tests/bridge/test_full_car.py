@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
 from rig.closed_loop.observability import Unknown, linear_model, observability
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.strut_response import linearise_at
 from rig.observers.none import NoObserver
 from tests.bridge.full_car import GRAVITY, FullCar
 from tests.bridge.test_larger_systems import OBSERVER, RATE_HZ, follow, noisy, wrong
@@ -102,7 +102,7 @@ def test_each_strut_of_a_full_car_is_estimated_as_if_it_stood_alone(tmp_path, co
     suspensions = [f"suspension_{name}" for name in CAR.corners]
     plant = wrong(model, share, suspensions)
     found = errors(plant, seen())
-    answers = strut_responses(plant, bench()[0][0])[4:]
+    answers = linearise_at(plant, bench()[0][0]).responses()[4:]
     for index, (error, answer) in enumerate(zip(found, answers, strict=True)):
         alone = error_alone(index, 1.0 / answer.mobility_per_kg, corrected=corrected, share=share)
         assert error < 1.1 * alone

@@ -45,7 +45,7 @@ def on_a_road():
 def driven_by_force(folder: Path):
     """The same quarter car on a platform that stands still, with a force on its body."""
     config = (CONFIGS / "quarter_car_road.yaml").read_text()
-    road = "  inputs:\n    road: {message: BENCH_ROAD, signal: ROAD, settling_s: 0.0015}\n"
+    road = "  inputs:\n    road: {message: BENCH_ROAD, signal: ROAD, settling_s: 0.001}\n"
     force = "  applied_force: {message: BENCH_MEASUREMENT, signal: APPLIED_FORCE}\n"
     assert road in config
     config = config.replace(road, force).replace("model: quarter_car_road", "model: still.yaml")

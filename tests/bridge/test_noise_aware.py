@@ -15,7 +15,7 @@ from rig.channels.channel import Sample
 from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.closed_loop.loop import Loop, SampleTiming
 from rig.closed_loop.poles import closed_loop_poles
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.strut_response import linearise_at
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import PiObserver
@@ -177,7 +177,7 @@ def test_a_start_from_several_heights_is_a_parabola_through_them():
 
 def test_answers_are_those_of_masses_springs_and_dampers():
     plant = DartPlant(load_model(MODELS / "quarter_car.yaml"))
-    tyre, suspension = strut_responses(plant, (0.29, 0.35))
+    tyre, suspension = linearise_at(plant, (0.29, 0.35)).responses()
     both = 1.0 / 3.0 + 1.0 / 15.0
     assert tyre == pytest.approx((1.0 / 3.0, 20000.0 / 3.0, 130.0 / 3.0), rel=1e-6)
     assert suspension == pytest.approx((both, 800.0 * both, 120.0 * both), rel=1e-6)

@@ -11,8 +11,10 @@ from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, FORCE, HEIGHT, VELOCITY
 from rig.observers.error_filter import ErrorFilter
+from rig.observers.error_model import ErrorModel
 from rig.observers.kalman import KalmanObserver
 from rig.observers.protocol import Innovation, Start
+from rig.observers.strut_observers import ObserversState, StrutObservers
 from tests.bridge.cores import MS, bench_sample, channels, measured, supervised
 from tests.observers.benches import Truth
 
@@ -35,30 +37,47 @@ def kalman(bandwidth_hz=BANDWIDTH_HZ, noise_std_m=NOISE_M):
     return KalmanObserver("kalman", ErrorFilter(bandwidth_hz, noise_std_m))
 
 
-def start(*sensors):
-    return Start(0, 0.1, MS, 0, 40.0, 2.0, sensors)
+MODEL = ErrorModel(
+    np.zeros((1, 2)), np.array([[-400.0, -20.0]]), np.array([[0.1]]), np.array([[1.0]])
+)
+"""A mass of 10 kg on a spring of 400 N/m with a damper of 20 N·s/m."""
 
 
-def undriven(state, t_ns):
-    """The state without the virtual force, which no model answers to here."""
-    return replace(state, error=replace(state.error, inputs=((t_ns, 0.0),)))
+class Alone:
+    """The observers of this strut; no model answers to the virtual force."""
+
+    def __init__(self, observer, *sensors):
+        self._observers = StrutObservers([observer])
+        start = Start(0, 0.1, MS, 0, 40.0, 2.0, sensors)
+        self.state = self._observers.init([start], MODEL, ObserversState())
+
+    def step(self, t_ns, height_m, further=()):
+        self.state = self._observers.step(self.state, t_ns, [Innovation(height_m, t_ns)], [further])
+        joint = self.state.joint
+        still = tuple((since_ns, np.zeros(1)) for since_ns, _ in joint.inputs)
+        self.state = replace(self.state, joint=replace(joint, inputs=still))
+        return self.state.struts[0]
+
+
+NEVER = sensor("strut.never", FORCE, 1.0, MS)
 
 
 def test_two_equal_sensors_are_one_of_half_the_variance():
     # The intensity of the force's noise is omega^10 sigma^2 h: the same with both.
-    both, one = kalman(), kalman(BANDWIDTH_HZ * 2.0**0.1, NOISE_M / np.sqrt(2.0))
-    fusing, alone = both.init(start(SECOND_HEIGHT)), one.init(start())
+    both = Alone(kalman(), SECOND_HEIGHT)
+    one = Alone(kalman(BANDWIDTH_HZ * 2.0**0.1, NOISE_M / np.sqrt(2.0)), NEVER)
     rng = np.random.default_rng(1)
     for tick in range(1, 2001):
         t_ns, (a, b) = tick * MS, NOISE_M * rng.standard_normal(2)
-        fusing = both.step(fusing, t_ns, Innovation(a, t_ns), [Innovation(b, t_ns, FIRST)])
-        alone = one.step(alone, t_ns, Innovation((a + b) / 2.0, t_ns))
-        fusing, alone = undriven(fusing, t_ns), undriven(alone, t_ns)
+        fusing = both.step(t_ns, a, [Innovation(b, t_ns, FIRST)])
+        alone = one.step(t_ns, (a + b) / 2.0)
         if tick > 1000:  # the scales of the variances follow other innovations
-            assert fusing.residual_force_n == pytest.approx(alone.residual_force_n, abs=2e-3)
-    ratio = fusing.force_std_n / alone.force_std_n
-    scales = np.sqrt(fusing.error.scale / alone.error.scale)
-    assert ratio == pytest.approx(scales, rel=1e-3)
+            assert fusing.residual_force_n == pytest.approx(
+                alone.residual_force_n, rel=0.01, abs=0.02
+            )
+    own, own_alone = (np.sqrt(it.state.joint.references[0].scale) for it in (both, one))
+    # Each lag is another one, of innovations that are not the same.
+    assert fusing.force_std_n / own == pytest.approx(alone.force_std_n / own_alone, rel=0.1)
 
 
 @settings(max_examples=30)
@@ -68,13 +87,13 @@ def test_two_equal_sensors_are_one_of_half_the_variance():
 )
 def test_a_late_reading_is_used_at_its_time(late, seed):
     """Whatever comes late: in the end the filter is the one that had all in order."""
-    observer, rng = kalman(), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     delayed = sensor("strut.wire", VELOCITY, 1e-3, MS, 5 * MS)
     readings = [(tick * MS + MS // 2, 1e-4 * rng.standard_normal()) for tick in range(30)]
     heights = NOISE_M * rng.standard_normal(40)
     found = []
     for delays in ([0] * 30, late):
-        state = observer.init(start(delayed))
+        bench = Alone(kalman(), delayed)
         for tick in range(1, 40):
             t_ns = tick * MS
             here = [
@@ -82,10 +101,9 @@ def test_a_late_reading_is_used_at_its_time(late, seed):
                 for (at_ns, value), delay in zip(readings, delays, strict=True)
                 if t_ns - MS < at_ns + delay * MS <= t_ns
             ]
-            state = observer.step(state, t_ns, Innovation(heights[tick], t_ns), here)
-            state = undriven(state, t_ns)
-        found.append(state.error)
-    assert np.allclose(found[0].mean, found[1].mean, rtol=1e-9, atol=1e-15)
+            bench.step(t_ns, heights[tick], here)
+        found.append(bench.state.joint.point)
+    assert np.allclose(found[0].mean, found[1].mean, rtol=1e-9, atol=1e-12)
     assert np.allclose(found[0].covariance, found[1].covariance, rtol=1e-9)
 
 
@@ -240,9 +258,6 @@ def test_two_steps_at_one_time_keep_the_input_of_both():
     for height_m in (0.40, 0.41):
         sample = Sample(0, height_m, 100 * MS)
         state, output, _ = core.step(state, StepInput(100 * MS, (sample,)))
-    driven = (
-        -output.struts[0].virtual_force_n * state.estimator.observers[0].error.start.mobility_per_kg
-    )
     state, _, _ = core.step(state, StepInput(101 * MS, (Sample(0, 0.4, 101 * MS),)))
-    inputs = dict(state.estimator.observers[0].fusion.inputs)
-    assert inputs[100 * MS] == driven
+    inputs = dict(state.estimator.observers.joint.inputs)
+    assert inputs[100 * MS] == output.struts[0].virtual_force_n

@@ -135,7 +135,7 @@ def test_up_to_five_measurement_intervals_the_model_goes_on():
     states, outputs = run(core(), inputs)
     assert {output.mode for output in outputs[FIRST - 1 :]} == {Mode.RUNNING}
     assert outputs[54].struts[0].height_m == pytest.approx(0.4, abs=1e-3)
-    assert states[54].estimator.observers[0].integral_m_s > 0.0
+    assert states[54].estimator.observers.struts[0].integral_m_s > 0.0
 
 
 def test_after_a_longer_gap_model_and_observer_start_again_from_measurements():
@@ -151,7 +151,7 @@ def test_after_a_longer_gap_model_and_observer_start_again_from_measurements():
     assert set(modes[starts:]) == {Mode.RUNNING}
     (strut,) = outputs[starts].struts
     assert (strut.height_m, strut.velocity_m_per_s) == pytest.approx((0.402, 0.0), abs=1e-9)
-    assert states[starts].estimator.observers[0].integral_m_s == 0.0
+    assert states[starts].estimator.observers.struts[0].integral_m_s == 0.0
 
 
 def test_a_constant_unknown_force_leaves_no_steady_innovation():
@@ -252,8 +252,8 @@ def test_a_stale_measurement_freezes_the_integral_and_then_leads_to_the_safe_sta
     assert modes[15:20] == [Mode.SETTLING] * 5
     assert modes[20:510] == [Mode.HOLD] * 490
     assert set(modes[510:]) == {Mode.SAFE}
-    assert {state.estimator.observers[0].integral_m_s for state in states[9:]} == {
-        states[9].estimator.observers[0].integral_m_s
+    assert {state.estimator.observers.struts[0].integral_m_s for state in states[9:]} == {
+        states[9].estimator.observers.struts[0].integral_m_s
     }
     assert [output.struts[0].valid for output in outputs[:16]] == [True] * 15 + [False]
 
@@ -413,7 +413,7 @@ def test_an_observer_is_the_same_alone_and_in_the_quarter_car(index):
     for tick, quarter in enumerate(states[FIRST:], start=FIRST):
         # The height that makes the same innovation at the model that is alone.
         state_free, free, _ = alone.step(state, measured(tick, None))
-        target = quarter.estimator.observers[index]
+        target = quarter.estimator.observers.struts[index]
         model_m = free.struts[0].height_m
         state, output, _ = alone.step(state, measured(tick, model_m + target.innovation_m))
         assert state_free.mode is state.mode
@@ -425,7 +425,7 @@ def test_one_observer_hears_only_its_own_strut():
     rig = core("quarter_car")
     states, _ = run(rig, resting(0.29, 0.4, ticks=20))
     other, _, _ = rig.step(states[-1], measured(20, None, 0.41))
-    before, after = states[-1].estimator.observers, other.estimator.observers
+    before, after = states[-1].estimator.observers.struts, other.estimator.observers.struts
     assert after[0] == before[0]
     assert after[1] != before[1]
 

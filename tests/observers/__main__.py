@@ -18,7 +18,7 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.strut_response import linearise_at
 from rig.demo.cases import compare_with_bench
 from rig.log.reader import read_run
 from rig.observers.error_filter import ErrorFilter
@@ -54,7 +54,7 @@ def point(given):
     )
     corner_hz = 0.1 * rate_hz / 2.0 / math.pi
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=noise_m), 1e7)
-    answers = strut_responses(truth.plant, [truth.rest_m])
+    answers = linearise_at(truth.plant, [truth.rest_m]).responses()
     [(mobility, *_)] = answers
     seen = longest_stretch(follow(truth, first, start), Path("grid"), STRUT, {STRUT: mobility})
     noise_std_m, residual_n = residual_force(seen, mobility)

@@ -16,7 +16,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
 from rig.bridge.values import Mode
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.strut_response import linearise_at
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
@@ -79,7 +79,7 @@ class Record:
 
 def compare(name, record, force_n=None):
     """Errors of the published gains, the tuned PI, the noise-aware observer; a row of the page."""
-    answers = strut_responses(record.plant, [record.rest_m])
+    answers = linearise_at(record.plant, [record.rest_m]).responses()
     [(mobility, *_)] = answers
     corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)

@@ -40,6 +40,7 @@ class ToyPlant:
     """Semi-implicit Euler in tenths of a step: enough to be followed by an observer."""
     struts = 1
     inputs = 1
+    internal_states = 0
     is_constant = True
 
     def __init__(self, spec):
@@ -75,7 +76,7 @@ class ToyPlant:
     def numbers(self, state):
         return state.height_m, state.velocity_m_per_s
 
-    def state_of(self, numbers):
+    def state_of(self, numbers, _t_s=0.0, _inputs=None):
         return State(*numbers)
 
 class Held(NamedTuple):
@@ -83,7 +84,6 @@ class Held(NamedTuple):
     virtual_force_n: float
     measured_ns: int
     force_std_n: float = float("nan")
-    law_error_n: float = 0.0
     left_out: tuple = ()
     is_disturbed: bool = False
 
@@ -97,8 +97,9 @@ class Proportional:
     gain_n_per_m: float = 1e5
 
     measurements_to_start = 1
-    requires_height = True
-    fuses_sensors = knows_std = asks_for_acceleration = False
+    requires_height = estimates_force = True
+    fuses_sensors = knows_std = is_joinable = False
+    height_std_m = None
     force_limit_n = 1e4
 
     def init(self, start):
@@ -106,7 +107,7 @@ class Proportional:
 
     steady_state = init
 
-    def step(self, state, t_ns, innovation, further=()):
+    def step(self, state, t_ns, innovation):
         if innovation is None:
             return state
         force_n = self.gain_n_per_m * innovation.value

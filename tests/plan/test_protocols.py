@@ -25,7 +25,7 @@ from rig.channels.measured_quantities import (
 )
 from rig.observers import OBSERVERS
 from rig.observers.protocol import Innovation, SensorStep, Start, TuningTask
-from rig.observers.strut_sensors import STRUT_SENSORS, Instant
+from rig.observers.strut_sensors import STRUT_SENSORS, Instant, StrutErrors
 from rig.plan.build import ENGINES
 from tests.bridge.cores import (
     FIRST,
@@ -59,7 +59,7 @@ def test_an_observer_steps_from_its_settings(kind):
         assert state.virtual_force_n == 0.0
         assert state.left_out == ()
         assert made.with_numbers(state, made.numbers(state)).virtual_force_n == 0.0
-        after = made.step(state, MS, Innovation(1e-4, MS), ())
+        after = made.step(state, MS, Innovation(1e-4, MS))
         assert made.step(after, 2 * MS, None).measured_ns >= after.measured_ns
         assert math.isfinite(after.virtual_force_n)
         assert math.isnan(after.force_std_n) is not made.knows_std
@@ -194,5 +194,6 @@ def test_every_quantity_of_a_strut_has_a_sensor():
         assert quantity.column == f"{key}_{quantity.noise.key.removeprefix('noise_std_')}"
         sensor = STRUT_SENSORS[quantity]
         assert math.isfinite(sensor.reading(instant, 0))
-        assert any(sensor.row(START))
+        rows = StrutErrors(*np.eye(3))
+        assert np.array_equal(sensor.error(rows), getattr(rows, key))
     assert all(quantity.noise is None for quantity in BENCH_QUANTITIES)

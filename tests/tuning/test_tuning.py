@@ -14,7 +14,7 @@ from dart_model.spec import MODELS, parse_model
 from rig.cli.main import main
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import OperatingPoint, least_damping
-from rig.closed_loop.strut_response import strut_responses
+from rig.closed_loop.strut_response import linearise_at
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.plan.config import CONFIGS
@@ -153,18 +153,18 @@ def test_a_tuned_loop_is_stable_beyond_the_knee_of_a_damper():
     content["struts"][0]["effects"] = [{"name": "valve_damping", "parameters": digressive}]
     plant = DartPlant(parse_model(yaml.safe_dump(content), "a test"))
     heights, fast = [0.5], OperatingPoint([0.5], 0.6)
-    responses = strut_responses(plant, heights)
+    assumed = linearise_at(plant, heights)
     timing = SampleTiming(2_000_000)
     slow = KalmanObserver("kalman", ErrorFilter.within(5.0, 1e-5), 5000.0)
 
     def damping(observer, point):
-        return least_damping(plant, (observer,), timing, responses, [point])[0]
+        return least_damping(plant, (observer,), timing, assumed, [point])[0]
 
     assert damping(slow, OperatingPoint([0.5], 0.05)) > 0.1
     assert damping(slow, fast) < 0.0
     expectation = expectation_from_noise(1e-5, 5.0, 4.0)
     problem = TuningProblem(
-        plant, (slow,), 0, responses, heights, timing, expectation, 5000.0, [fast]
+        plant, (slow,), 0, assumed, heights, timing, expectation, 5000.0, [fast]
     )
     found = tune_observer(problem, "kalman", Aim())
     assert found.in_motion == pytest.approx(damping(found.observer, fast))
