@@ -10,7 +10,9 @@ An estimator knows no modes: when its estimate is published, and as what, is dec
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from dart_model.protocol import AnySensorReader
 from dart_model.virtual_sensors import VirtualSensor
@@ -92,6 +94,10 @@ class Estimator(Protocol[StateT]):
 
     def model_of(self, state: StateT) -> object | None:
         """The model under its forces, for virtual sensors; None where none moves."""
+        ...
+
+    def force_covariance_n2(self, state: StateT) -> NDArray[np.float64]:
+        """Covariance of the errors of the struts' forces, (struts, struts); NaN if not known."""
         ...
 
     def with_settings(

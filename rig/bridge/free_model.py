@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, AnySensorReader, LoadedModel, ModelState
@@ -15,14 +16,17 @@ from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
 from rig.bridge.measurement_age import is_too_old
+from rig.bridge.tracked_motion import NoiseGains
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import TEMPERATURE
-from rig.closed_loop.strut_response import linearise
+from rig.closed_loop.strut_response import laws_by_motion, linearise
 from rig.observers.error_model import StrutResponse
 from rig.observers.protocol import AnyObserver, Innovation, Start
 from rig.observers.strut_observers import ObserversState, StrutObservers
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
+
+Array = NDArray[np.float64]
 
 _AT_ONCE = 4
 """Intervals that may not be over in less than half of their time."""
@@ -46,6 +50,8 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
+        input_noises: Of each motion among the inputs the covariance of the laws' forces by its
+            noise, over the mean square of its innovations, N²/m², shape (struts, struts).
     """
 
     t_ns: int
@@ -59,6 +65,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
+    input_noises: tuple[Array, ...] = ()
 
 
 _Received = Sequence[Sample | None]
@@ -140,6 +147,12 @@ class FreeModelEstimator:
         for index, item in enumerate(inputs):
             for channel in item.channels:
                 self._input_of[channel.index] = index
+        ends = itertools.accumulate([len(item.values(None, 0)) for item in inputs], initial=0)
+        self._motions = tuple(
+            (index, column, noise)
+            for index, (item, column) in enumerate(zip(inputs, ends, strict=False))
+            if (noise := item.noise()) is not None
+        )
         self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
         self._silences_ns = [grace + stale_after_ns for grace in self._graces_ns]
 
@@ -292,9 +305,30 @@ class FreeModelEstimator:
             model=loaded,
             longest_gaps_ns=longest_gaps_ns,
             bands=state.bands or (InnovationBand(),) * len(first),
+            input_noises=tuple(
+                self._input_noise(model, inputs, column, gains)
+                for _, column, gains in self._motions
+            ),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, no_forces, self._newest_ns(state))
+
+    def _input_noise(
+        self, model: ModelState, inputs: Sequence[float], column: int, gains: NoiseGains
+    ) -> Array:
+        """Covariance of the laws' forces by the noise of a motion, as of `FreeModelState`."""
+        slopes = laws_by_motion(self._plant, model, inputs, column)
+        return slopes @ gains.covariance @ slopes.T / gains.innovation
+
+    def force_covariance_n2(self, state: FreeModelState) -> Array:
+        joint = state.observers.joint
+        if joint is None or joint.covariance_n2 is None:
+            known = np.diag([strut.force_std_n**2 for strut in state.observers.struts])
+        else:
+            known = joint.covariance_n2
+        for (index, _, _), noise in zip(self._motions, state.input_noises, strict=True):
+            known = known + self._inputs[index].square_m2(state.inputs[index]) * noise
+        return known
 
     def _start_of_strut(
         self, strut: int, samples: Sequence[Sample], t_ns: int, response: StrutResponse
@@ -330,7 +364,8 @@ class FreeModelEstimator:
 
     def _newest_ns(self, state: FreeModelState) -> int:
         """Time of the oldest of the newest measurements before the model starts."""
-        newest_ns = min(samples[-1].t_ns for samples in state.first if samples)
+        # Without an observer no measurement is awaited.
+        newest_ns = min((it[-1].t_ns for it in state.first if it), default=state.t_ns)
         return min(newest_ns, self._newest_input_ns(state.inputs, newest_ns))
 
     def _newest_input_ns(self, inputs: Sequence[InputState | None], newest_ns: int) -> int:
@@ -419,6 +454,7 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
+            state.input_noises,
         )
         return self._estimate(after, loaded, virtual_n, oldest_ns)
 
@@ -485,6 +521,9 @@ class FreeModelEstimator:
         size = sum(loaded.inputs)
         is_calm = state.is_settled
         t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
+        stds_n = [observer.force_std_n for observer in state.observers.struts]
+        if self._motions:
+            stds_n = np.sqrt(np.diagonal(self.force_covariance_n2(state))).tolist()
         for strut, observer in enumerate(state.observers.struts):
             if (
                 observer.is_disturbed
@@ -503,7 +542,7 @@ class FreeModelEstimator:
                 velocity_m_per_s,
                 loaded.accelerations_m_per_s2[strut],
                 observer.innovation_m,
-                observer.force_std_n,
+                stds_n[strut],
                 law_force_n,
             )
             struts.append(output)

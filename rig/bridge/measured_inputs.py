@@ -14,13 +14,18 @@ from msgspec.structs import replace
 from rig.bridge.measurement_age import age_limit_ns
 from rig.bridge.tracked_motion import (
     SETTLED,
+    NoiseGains,
     TrackedMotion,
     accelerate,
+    noise_gains,
     predict_motion,
     update_motion,
     update_with_acceleration,
 )
 from rig.channels.channel import Channel, Sample
+
+_FADING_S = 1.0
+"""Time constant with which the innovations' mean square is followed."""
 
 _LONGEST_GAP = 10
 """Intervals after which a motion is followed from the next position on, as from the first."""
@@ -58,6 +63,14 @@ class MeasuredInput(Protocol[StateT]):
         """Whether a model can start with it."""
         ...
 
+    def noise(self) -> NoiseGains | None:
+        """What the noise of its samples does to a motion that is followed; None of any other."""
+        ...
+
+    def square_m2(self, state: StateT | None) -> float:
+        """Mean square of the innovations of a motion that is followed; 0 of any other."""
+        ...
+
 
 AnyInput = MeasuredInput[Any]
 """An input of whatever kind: its states come from it alone and go back to it alone."""
@@ -84,12 +97,25 @@ class HeldInput:
     def is_ready(self, state: Sample | None) -> bool:
         return state is not None or self.channel is None
 
+    def noise(self) -> None:
+        return None
+
+    def square_m2(self, state: Sample | None) -> float:
+        del state
+        return 0.0
+
 
 class Followed(Struct, frozen=True, gc=False):
-    """A motion, and the time since which it is followed without a gap."""
+    """A motion that is followed.
+
+    Attributes:
+        since_ns: Time since which it is followed without a gap.
+        square_m2: Mean square of its innovations of late, without those of the first moments.
+    """
 
     motion: TrackedMotion
     since_ns: int
+    square_m2: float = 0.0
 
     @property
     def t_ns(self) -> int:
@@ -120,7 +146,23 @@ class MovedInput:
         if state is None or sample.t_ns - state.t_ns > _LONGEST_GAP * interval_ns:
             return Followed(TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns), sample.t_ns)
         update = update_motion if self.acceleration is None else update_with_acceleration
-        return replace(state, motion=update(state.motion, sample, self.settling_s))
+        motion, square_m2 = update(state.motion, sample, self.settling_s), state.square_m2
+        if motion is not state.motion and self.is_ready(state):
+            new_m2 = motion.innovation_m * motion.innovation_m
+            since_s = (motion.measured_ns - state.since_ns) * 1e-9 - SETTLED * self.settling_s
+            share = min(1.0, interval_ns * 1e-9 / min(max(since_s, 1e-9), _FADING_S))
+            square_m2 += share * (new_m2 - square_m2)
+        return Followed(motion, state.since_ns, square_m2)
+
+    def noise(self) -> NoiseGains:
+        return noise_gains(
+            self.settling_s,
+            self.position.interval_ns * 1e-9,
+            has_acceleration=self.acceleration is not None,
+        )
+
+    def square_m2(self, state: Followed | None) -> float:
+        return 0.0 if state is None else state.square_m2
 
     def values(self, state: Followed | None, t_ns: int) -> tuple[float, float, float]:
         return (0.0, 0.0, 0.0) if state is None else predict_motion(state.motion, t_ns)

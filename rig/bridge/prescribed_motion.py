@@ -11,8 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
 from dart_model.errors import ModelError
@@ -165,6 +167,10 @@ class PrescribedMotionEstimator:
 
     def model_of(self, state: PrescribedMotionState) -> None:
         del state
+
+    def force_covariance_n2(self, state: PrescribedMotionState) -> NDArray[np.float64]:
+        del state
+        return np.full((self.struts, self.struts), np.nan)
 
     def step(
         self, state: PrescribedMotionState, step_input: StepInput

@@ -9,9 +9,12 @@ fading-memory polynomial filters of second and of first degree.
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from rig.channels.channel import Sample
 
@@ -92,20 +95,31 @@ def accelerate(motion: TrackedMotion, sample: Sample) -> TrackedMotion:
     return replace(motion, acceleration_m_per_s2=sample.value)
 
 
-def position_noise_gain(settling_s: float, interval_s: float, *, has_acceleration: bool) -> float:
-    """Standard deviation of a followed position over that of white noise in its samples.
+class NoiseGains(NamedTuple):
+    """Errors of a followed motion at the time of a sample by white noise of unit variance in these.
 
-    It is that at the time of a sample, by the response to a single one.
+    Attributes:
+        covariance: Of position (m) and velocity (m/s), shape (2, 2).
+        innovation: Variance of the innovations.
     """
+
+    covariance: NDArray[np.float64]
+    innovation: float
+
+
+def noise_gains(settling_s: float, interval_s: float, *, has_acceleration: bool) -> NoiseGains:
+    """What white noise of samples does to a followed motion, by the response to a single one."""
     update = update_with_acceleration if has_acceleration else update_motion
     step_ns = round(interval_s * 1e9)
     motion = update(TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), Sample(0, 1.0, step_ns), settling_s)
-    square, number = 0.0, 1
+    covariance, innovation, number = np.zeros((2, 2)), 0.0, 1
     while True:
-        square += motion.position_m**2
+        now = np.array([motion.position_m, motion.velocity_m_per_s])
+        covariance += np.outer(now, now)
+        innovation += motion.innovation_m**2
         number += 1
         if number * interval_s > SETTLED * 2.0 * settling_s + 3.0 * interval_s:
-            return math.sqrt(square)
+            return NoiseGains(covariance, innovation)
         motion = update(motion, Sample(0, 0.0, number * step_ns), settling_s)
 
 

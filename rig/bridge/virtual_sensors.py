@@ -4,7 +4,7 @@ Bodies and joints move as the model does, under the estimated forces of the stru
 observer states how well it knows a force, so is known what depends on it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,14 +40,14 @@ class SensedState(Struct, frozen=True, gc=False):
     """What is remembered between two ticks.
 
     Attributes:
-        squared_gains: Square of the change of each sensor of the model by a newton in each strut,
-            where it started, shape (sensors, struts).
+        gains: Change of each sensor of the model by a newton in each strut, where it started,
+            shape (sensors, struts).
         powers_w: Power that each strut took.
         energies_j: Energy that each strut has taken since the model started.
     """
 
     t_ns: int
-    squared_gains: Array
+    gains: Array
     powers_w: tuple[float, ...]
     energies_j: tuple[float, ...]
 
@@ -88,8 +88,11 @@ class VirtualSensors:
         t_ns: int,
         loaded: Any,
         struts: Sequence[StrutOutput],
+        covariance_n2: Callable[[], Array],
     ) -> tuple[SensedState, list[float]]:
         """State and readings at a tick whose model is `loaded` and whose struts act as estimated.
+
+        `covariance_n2` is that of the errors of their forces, shape (struts, struts).
 
         The readings are the value of each sensor in SI, followed by its standard deviation where it
         has one. `loaded` is None where no model moves; then there are sensors of struts alone.
@@ -102,8 +105,8 @@ class VirtualSensors:
             stds = self._no_stds
             # Not NaN: the observers know it.
             if self._shows_std and struts[0].force_std_n == struts[0].force_std_n:
-                variances = np.array([strut.force_std_n * strut.force_std_n for strut in struts])
-                stds = np.sqrt(state.squared_gains @ variances).tolist()
+                variances = ((state.gains @ covariance_n2()) * state.gains).sum(axis=1)
+                stds = np.sqrt(variances).tolist()
             known = known + stds
         motions = zip(struts, state.powers_w, state.energies_j, strict=True)
         for strut, power_w, energy_j in motions:
@@ -118,7 +121,7 @@ class VirtualSensors:
         powers_w = tuple([-strut.force_n * strut.velocity_m_per_s for strut in struts])
         if state is None:
             gains = [] if self._reader is None else self._reader.force_gains(loaded)
-            return SensedState(t_ns, np.square(gains), powers_w, (0.0,) * len(struts))
+            return SensedState(t_ns, np.array(gains), powers_w, (0.0,) * len(struts))
         half_s = 0.5e-9 * (t_ns - state.t_ns)
         energies_j = tuple(
             [
@@ -128,4 +131,4 @@ class VirtualSensors:
                 )
             ]
         )
-        return SensedState(t_ns, state.squared_gains, powers_w, energies_j)
+        return SensedState(t_ns, state.gains, powers_w, energies_j)

@@ -74,6 +74,25 @@ def _motion(positions: Array, n: int) -> Array:
     return np.concatenate([positions, np.zeros(n)])
 
 
+def laws_by_motion(
+    plant: AnyPlant, state: ModelState, inputs: Sequence[float], column: int
+) -> Array:
+    """Change of the forces of the struts' laws by a motion among the inputs, shape (struts, 2).
+
+    By its position (m) and by its velocity (m/s); `column` is where the former is in the inputs.
+    """
+    numbers = plant.numbers(state)
+
+    def forces_n(change: Array) -> Array:
+        changed = np.array(inputs, np.float64)
+        changed[column : column + 2] += change
+        moved = plant.state_of(numbers, 0.0, changed.tolist())
+        no_forces = (0.0,) * plant.struts
+        return np.array(plant.load(moved, no_forces, changed.tolist(), AMBIENT_C).forces_n)
+
+    return central_differences(forces_n, (_SECANT_M, USUAL_SPEED_M_PER_S))
+
+
 def linearise_at(plant: AnyPlant, heights_m: Sequence[float]) -> ErrorModel:
     """Motion of a model about rest at some heights, without inputs."""
     return linearise(plant, plant.init(heights_m), (0.0,) * plant.inputs)

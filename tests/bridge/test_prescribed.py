@@ -19,7 +19,7 @@ from rig.bridge.tracked_motion import (
     TrackedMotion,
     accelerate,
     lag_free_hz,
-    position_noise_gain,
+    noise_gains,
     predict_motion,
     update_motion,
     update_with_acceleration,
@@ -499,9 +499,11 @@ def test_noise_of_positions_is_passed_on_as_reported(settling_s, has_acceleratio
     motion, passed = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), []
     for number, value in enumerate(noise.tolist(), start=1):
         motion = update(motion, Sample(0, value, number * TICK_NS), settling_s)
-        passed.append(motion.position_m)
-    reported = position_noise_gain(settling_s, 1e-3, has_acceleration=has_acceleration)
-    assert np.std(passed[100:]) == pytest.approx(reported, rel=0.02)
+        passed.append([motion.position_m, motion.velocity_m_per_s, motion.innovation_m])
+    reported = noise_gains(settling_s, 1e-3, has_acceleration=has_acceleration)
+    found = np.cov(np.array(passed[100:]).T)
+    assert np.allclose(found[:2, :2], reported.covariance, rtol=0.06)
+    assert found[2, 2] == pytest.approx(reported.innovation, rel=0.04)
 
 
 @pytest.mark.parametrize("settling_s", [0.0015, 0.004])
