@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from tests.diagnosis_benchmark.moving import MovingCase
 from tests.truth.cases import FOREIGN_KINDS
 from tests.truth.compiled import REFERENCE_C
 from tests.truth.plant import Bench, Case
@@ -266,17 +267,42 @@ def is_bounded(estimate: dict) -> bool:
     return estimate["low"] is not None and estimate["high"] is not None
 
 
-def intervals(case: Case, diagnosis: dict) -> list[Interval]:
+def intervals(case: Case | MovingCase, diagnosis: dict) -> list[Interval]:
     """Every interval of a diagnosis that the truth can be held against.
 
     Args:
         case: The truth.
         diagnosis: The diagnosis.
     """
+    if isinstance(case, MovingCase):
+        held = list(_of_moving(case, diagnosis["effects"]))
+        return [interval for interval in held if math.isfinite(interval.high - interval.low)]
     if any(case.kind.endswith(kind) for kind in FOREIGN_KINDS):
         return []
     held = [*_of_effects(case, diagnosis["effects"]), *_of_totals(case, diagnosis)]
     return [interval for interval in held if math.isfinite(interval.high - interval.low)]
+
+
+MOVING: dict[str, dict[str, str]] = {
+    "friction": {
+        f"{name}_friction": "coulomb_force_n"
+        for name in ("coulomb", "stribeck", "presliding", "elastoplastic", "lugre")
+    },
+    "cubic_stiffness": {"cubic_stiffness": "stiffness_n_per_m3"},
+    "quadratic_damping": {"quadratic_damping": "damping_n_s2_per_m2"},
+    "bump_stop": {"hertz_bump_stop": "contact_height_m"},
+}
+"""Effect of a simulated bench -> parameter of the same name and meaning in each of ours."""
+
+
+def _of_moving(case: MovingCase, found: list[dict]) -> Iterator[Interval]:
+    for planted in case.effects:
+        for answer in found:
+            parameter = MOVING[planted.name].get(answer["name"])
+            if parameter is None or answer["strut"] != planted.strut:
+                continue
+            estimate, truth = answer["parameters"][parameter], planted.parameters[parameter]
+            yield _interval(planted.name, f"{answer['name']}.{parameter}", truth, estimate)
 
 
 def _of_effects(case: Case, found: list[dict]) -> Iterator[Interval]:

@@ -16,9 +16,9 @@ from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
-from tests.diagnosis_benchmark.plan import Slot, fill
+from tests.diagnosis_benchmark.moving import MovingCase, write_moving
+from tests.diagnosis_benchmark.plan import Slot, fill, ratios_of
 from tests.truth.files import write_case
-from tests.truth.simulation import floor_ratios
 
 
 def diagnose(folder: Path) -> dict:
@@ -91,8 +91,9 @@ def execute(slot: Slot, out: Path, limit_s: float) -> Result:
         return load_result(kept)
     case = fill(slot)
     folder = out / "cases" / slot.name
-    train, _ = write_case(case, folder)
-    ratios = tuple(float(ratio) for ratio in floor_ratios(case, train))
+    write = write_moving if isinstance(case, MovingCase) else write_case
+    write(case, folder)
+    ratios = ratios_of(case)
     started = time.perf_counter()
     with within(limit_s):
         diagnosis = diagnose(folder)

@@ -11,6 +11,7 @@ from tests.diagnosis_benchmark.comparable import (
     intervals,
     is_bounded,
 )
+from tests.diagnosis_benchmark.moving import RATE_HZ, MovingCase
 from tests.truth.cases import LINEAR_FAMILIES
 from tests.truth.plant import Case
 from tests.truth.simulation import height_floor_m
@@ -164,10 +165,15 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _errors(case: Case, diagnosis: dict) -> dict[str, str | float]:
+def _errors(case: Case | MovingCase, diagnosis: dict) -> dict[str, str | float]:
     """Held-out errors and floors, as fields of a `Result`."""
     held_out, claimed = diagnosis.get("held_out") or {}, diagnosis.get("noise_floor") or {}
-    if case.is_dyno:
+    if isinstance(case, MovingCase):
+        # Noise of the base is part of what a right model leaves, by the model's own resonances.
+        error = held_out.get("height_rmse_m") or {}
+        own_floor = _number(claimed.get("height_rmse_m"))
+        floor, unit = own_floor, "m"
+    elif case.is_dyno:
         error = held_out.get("strut_force_rmse_n") or held_out.get("residual_force_rmse_n") or {}
         own_floor = _number(claimed.get("residual_force_rmse_n"))
         floor, unit = own_floor, "N"
@@ -184,19 +190,22 @@ def _errors(case: Case, diagnosis: dict) -> dict[str, str | float]:
     }
 
 
-def judge(case: Case, ratios: tuple[float, ...], diagnosis: dict, slot: str, group: str) -> dict:
+def judge(
+    case: Case | MovingCase, ratios: tuple[float, ...], diagnosis: dict, slot: str, group: str
+) -> dict:
     """All of a `Result` but its duration, as its fields."""
     found = diagnosis["effects"]
-    is_rough = not case.roughness.is_exact
+    is_moving = isinstance(case, MovingCase)
+    is_rough = is_moving or not case.roughness.is_exact
     return _errors(case, diagnosis) | {
         "slot": slot,
         "group": group,
         "case": case.name,
         "planted": case.families,
-        "laws": tuple(effect.law for effect in case.effects),
+        "laws": tuple(it.name if is_moving else it.law for it in case.effects),
         "ratios": ratios,
         "is_rough": is_rough,
-        "sample_rate_hz": case.sensors.sample_rate_hz,
+        "sample_rate_hz": RATE_HZ if is_moving else case.sensors.sample_rate_hz,
         "verdict": diagnosis["verdict"],
         "families": tuple(effect["family"] for effect in found),
         "names": tuple(effect["name"] for effect in found),

@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.diagnosis_benchmark import moving
+from tests.diagnosis_benchmark.moving import MovingCase, make_moving, moving_ratios
 from tests.truth import dyno
 from tests.truth.cases import FAMILIES, FOREIGN_KINDS, NONLINEAR_FAMILIES, make_case
 from tests.truth.plant import Case
@@ -56,6 +58,7 @@ GROUPS = {
     ),
     "dyno_pair": Group(10, ("dyno_pair",), "two effects on a dyno, half rough"),
     "dyno_complete": Group(20, ("dyno_complete",), "nothing planted on a dyno, half rough"),
+    "moving": Group(60, moving.KINDS, "one to three effects, base moved, rough nominal model"),
     "faint": Group(0, FAMILIES, "one effect below five times the floor"),
 }
 
@@ -107,22 +110,30 @@ def _kind(group: str, index: int, count: int) -> str:
     return kinds[index * len(kinds) // count if count < len(kinds) else index % len(kinds)]
 
 
-def _candidates(slot: Slot) -> Iterator[Case]:
+def _candidates(slot: Slot) -> Iterator[Case | MovingCase]:
+    make = make_moving if slot.kind in moving.KINDS else make_case
     for attempt in range(ATTEMPTS):
-        yield make_case(slot.seed * SEEDS_PER_GROUP + slot.index * ATTEMPTS + attempt, slot.kind)
+        yield make(slot.seed * SEEDS_PER_GROUP + slot.index * ATTEMPTS + attempt, slot.kind)
 
 
-def _is_fit(slot: Slot, case: Case) -> bool:
+def ratios_of(case: Case | MovingCase) -> tuple[float, ...]:
+    """How far each effect of a case stands above the noise floor."""
+    if isinstance(case, MovingCase):
+        return moving_ratios(case)
+    return tuple(float(ratio) for ratio in floor_ratios(case, record(case, case.train)))
+
+
+def _is_fit(slot: Slot, case: Case | MovingCase) -> bool:
     if not case.effects:
         return True
-    ratios = floor_ratios(case, record(case, case.train))
+    ratios = np.array(ratios_of(case))
     if slot.group == "faint":
         return bool(np.all(ratios < LEAST_RATIO))
     least = LEAST_RATIO_OUTSIDE if slot.group == "outside" else LEAST_RATIO
     return bool(np.all(ratios >= least))
 
 
-def fill(slot: Slot) -> Case:
+def fill(slot: Slot) -> Case | MovingCase:
     """The first case for a slot whose effects all stand as high above the floor as they should."""
     for case in _candidates(slot):
         if _is_fit(slot, case):
