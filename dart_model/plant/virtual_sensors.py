@@ -83,7 +83,9 @@ class VirtualSensors:
         self._gravity = np.array([0.0, 0.0, -spec.gravity_m_per_s2])
         self._reads_joints = any(it.kind in ("reaction_of", "torque_of") for it in sensors.values())
         self._readers = [self._reader(name, sensor) for name, sensor in sensors.items()]
-        self._affine = self._find_affine()
+        self.affine = self._find_affine()
+        """Readings by positions, rates, accelerations, strut forces, inputs, more force in
+        parallel with the struts, and one; None where a sensor is curved."""
 
     def read(self, loaded: Loaded, residual_forces_n: Sequence[float]) -> list[float]:
         """What the sensors show in a state, in SI.
@@ -92,8 +94,8 @@ class VirtualSensors:
         """
         forces = [law + more for law, more in zip(loaded.forces_n, residual_forces_n, strict=True)]
         state = loaded.state
-        if self._affine is not None:
-            matrix = self._affine
+        if self.affine is not None:
+            matrix = self.affine
             change = [
                 a - b for a, b in zip(residual_forces_n, loaded.virtual_forces_n, strict=True)
             ]

@@ -7,18 +7,24 @@ import typer
 from rich.console import Console
 
 from can_dbc.errors import InputError
+from rig.cli.added_sensors import ADDED_HELP, read_sensors
 from rig.cli.progress import progress_bar
 from rig.cli.terminal import JsonFlag, print_json, print_text
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rig.log.reader import RunFolder
+    from rig.plan.config import VirtualSensorConfig
 
 EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
     "`rig export runs/7 --format candump --out run.log` · "
     "`rig export runs/7 --format csv --smoothed --out run.csv` · "
     "`rig export out/corrected.yaml --fmu --out strut.fmu` · "
-    "`rig export out/corrected.yaml --fmu --bench --fmi 3.0 --out bench.fmu`"
+    "`rig export out/corrected.yaml --fmu --bench --fmi 3.0 --out bench.fmu` · "
+    "`rig export out/corrected.yaml --fmu --bench --add 'seat: {acceleration_of: body}' --out "
+    "bench.fmu`"
 )
 
 
@@ -60,6 +66,14 @@ def export_command(
             help="With --fmu: export the whole bench; it must have one guided degree of freedom.",
         ),
     ] = False,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--add",
+            metavar="SENSOR",
+            help=f"With --bench: virtual sensor that is an output of the FMU: {ADDED_HELP}",
+        ),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Export a run or a model to other programs.
@@ -74,10 +88,12 @@ def export_command(
         raise InputError(
             "--smoothed: expected --format csv with it: the other formats are read back as runs"
         )
+    if add and not bench:
+        raise InputError("--add: expected --fmu --bench with it; for a run use rig replay --add")
     if fmu:
         if bench and strut is not None:
             raise InputError("--bench and --strut: expected one of them")
-        _export_model(source, out, fmi, strut, bench, as_json=as_json)
+        _export_model(source, out, fmi, strut, bench, read_sensors(add or []), as_json=as_json)
         return
     if bench or strut is not None:
         raise InputError("--bench and --strut: expected --fmu with them")
@@ -120,7 +136,14 @@ def _export_run(
 
 
 def _export_model(
-    source: Path, out: Path, fmi: str, strut: str | None, bench: bool, *, as_json: bool
+    source: Path,
+    out: Path,
+    fmi: str,
+    strut: str | None,
+    bench: bool,
+    sensors: "Mapping[str, VirtualSensorConfig]",
+    *,
+    as_json: bool,
 ) -> None:
     from dart_model.spec import load_model
     from rig.fmu.export import export_fmu
@@ -128,7 +151,13 @@ def _export_model(
     spec = load_model(source)
     with Console(stderr=True).status("compiling") as status:
         component = export_fmu(
-            spec, out, fmi, strut, bench, lambda target: status.update(f"{target} compiled")
+            spec,
+            out,
+            fmi,
+            strut,
+            bench,
+            lambda target: status.update(f"{target} compiled"),
+            sensors,
         )
     kinds = ("input", "state", "output")
     names = {f"{kind}s": [item.name for _, item in component.of(kind)] for kind in kinds}

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.added_sensors import ADDED_HELP, read_sensors
 from rig.cli.progress import progress_line
 from rig.cli.summary_file import SummaryFolder, write_summary
 from rig.cli.terminal import (
@@ -19,7 +20,6 @@ from rig.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from rig.plan.config import VirtualSensorConfig
     from rig.run.replay import Replay
 
 EXAMPLES = (
@@ -33,8 +33,7 @@ _Added = Annotated[
         "--add",
         metavar="SENSOR",
         help="Virtual sensor that is computed and kept beside the log, where exports and "
-        "`rig.open_run` find it: a name and what it reads, as under virtual_sensors of a "
-        "configuration, or a YAML file with that section. Once for each.",
+        f"`rig.open_run` find it: {ADDED_HELP}",
     ),
 ]
 
@@ -50,7 +49,7 @@ def replay_command(
     from rig.log.reader import find_changed_files
     from rig.run.replay import replay
 
-    sensors = _read_sensors(add or [])
+    sensors = read_sensors(add or [])
     with progress_line(None) as progress:
         result = replay(folder, sensors=sensors, progress=progress)
     if sensors:
@@ -86,28 +85,6 @@ def replay_command(
     refuse_damage(folder, result.damage)
     if result.different or changed or result.steps.num_rows == 0:
         raise typer.Exit(FAILED)
-
-
-def _read_sensors(texts: Sequence[str]) -> "dict[str, VirtualSensorConfig]":
-    """Virtual sensors by name, from texts or files."""
-    from can_dbc.errors import InputError
-    from can_dbc.yaml_file import parse_mapping, read_text, validate
-    from rig.plan.config import VirtualSensorConfig
-
-    sensors: dict[str, VirtualSensorConfig] = {}
-    for text in texts:
-        source = "--add"
-        if Path(text).is_file() or ":" not in text:
-            source = f"--add {text}"
-            section = parse_mapping(read_text(Path(text)), text).get("virtual_sensors")
-            if not isinstance(section, dict):
-                raise InputError(f"{source}: expected a section virtual_sensors")
-            given = cast("dict[str, object]", section)
-        else:
-            given = parse_mapping(text, source)
-        for name, item in given.items():
-            sensors[name] = validate(VirtualSensorConfig, item, f"{source}: {name}")
-    return sensors
 
 
 def _columns_of(names: Sequence[str], sensors: Mapping[str, object]) -> list[str]:

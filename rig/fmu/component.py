@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,6 +19,8 @@ from dart_model.effects.calling import STRUT, Origin, arguments
 from dart_model.effects.law import Force, Rate
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
+from dart_model.virtual_sensors import KINDS as SENSOR_KINDS
+from dart_model.virtual_sensors import VirtualSensor
 from rig.fmu.law_in_c import InC, in_c
 
 Kind = Literal["time", "input", "parameter", "fixed", "state", "rate", "output", "indicator"]
@@ -98,13 +101,16 @@ def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
     return made.component(spec.name, f"{spec.name}_{strut.name}", meaning, text)
 
 
-def bench_component(spec: ModelSpec) -> Component:
-    """A bench of one guided degree of freedom, with its struts.
+def bench_component(
+    spec: ModelSpec, sensors: Mapping[str, VirtualSensor] = MappingProxyType({})
+) -> Component:
+    """A bench of one guided degree of freedom, with its struts and with virtual sensors.
 
     Raises:
-        InputError: The model has more degrees of freedom, or one that is not guided along a line.
+        InputError: The model has more degrees of freedom, or one that is not guided along a line;
+            or a sensor reads what the model does not have.
     """
-    guide = _guide(spec)
+    guide = _guide(spec, sensors)
     made = _Build()
     made.add("applied_force_n", "N", "input", "applied force", 0.0)
     made.add("temperature_c", "degC", "input", "temperature of the damper", AMBIENT_C)
@@ -146,6 +152,21 @@ def bench_component(spec: ModelSpec) -> Component:
     total = " + ".join([applied, *forces, weight])
     text.append(f"{_ref(f'der({height})')} = {_ref(velocity)};")
     text.append(f"{_ref(f'der({velocity})')} = ({total}) / ({' + '.join(masses)});")
+    for (name, item), row in zip(sensors.items(), guide.sensors, strict=True):
+        quantity = item.quantity(is_turning=False)
+        unit = quantity.dimension.value.replace("^", "").replace("*", ".")
+        variable = f"{_identifier(name)}.{quantity.suffix}"
+        made.add(variable, unit, "output", f"{quantity.meaning}: {item.target}")
+        numbers = [
+            _ref(height),
+            _ref(velocity),
+            _ref(f"der({velocity})"),
+            *(_ref(f"{_identifier(strut.name)}.force_n") for strut in spec.struts),
+            _ref("applied_force_n"),
+            "1.0",
+        ]
+        terms = [f"{share!r} * {number}" for share, number in zip(row, numbers, strict=True)]
+        text.append(f"{_ref(variable)} = {' + '.join(terms)};")
     meaning = (
         f"Bench {spec.name}: one guided degree of freedom under an applied force, which is "
         "positive upwards. Strut forces are positive when they push the two bodies apart."
@@ -324,6 +345,8 @@ class _Guide(NamedTuple):
         offsets_m: Height of each strut where the first one's is zero.
         rest_height_m: Height of the first strut at rest.
         longest_step_s: Longest step of the model's integrator.
+        sensors: Of each virtual sensor the shares of the first strut's height, its two derivatives,
+            the forces of the struts, the applied force, and one.
     """
 
     mass_kg: float
@@ -334,9 +357,10 @@ class _Guide(NamedTuple):
     offsets_m: list[float]
     rest_height_m: float
     longest_step_s: float
+    sensors: list[list[float]]
 
 
-def _guide(spec: ModelSpec) -> _Guide:
+def _guide(spec: ModelSpec, sensors: Mapping[str, VirtualSensor]) -> _Guide:
     plant = DartPlant(spec)
     if plant.coordinates != 1 or plant.inputs != 1 or not plant.is_constant:
         raise InputError(
@@ -362,7 +386,38 @@ def _guide(spec: ModelSpec) -> _Guide:
         (offsets - ratios * offsets[0]).tolist(),
         rest.struts[0][0],
         plant.step_s,
+        _sensor_rows(spec, plant, sensors, float(rows[0]), float(offsets[0])),
     )
+
+
+def _sensor_rows(
+    spec: ModelSpec,
+    plant: DartPlant,
+    sensors: Mapping[str, VirtualSensor],
+    row: float,
+    offset_m: float,
+) -> list[list[float]]:
+    """Shares of what virtual sensors read, as of `_Guide`; ``height = offset + row * q``."""
+    for name, item in sensors.items():
+        if SENSOR_KINDS[item.kind].of == "strut":
+            raise InputError(
+                f"--add {name}: {item.kind} {item.target!r}: the FMU has outputs of the struts "
+                "already, expected a body or a joint"
+            )
+    affine = plant.virtual_sensors(sensors).affine if sensors else None
+    if affine is None:
+        if sensors:
+            raise InputError(
+                f"model {spec.name}: --add: expected sensors that are linear in the motion"
+            )
+        return []
+    found: list[list[float]] = []
+    for position, velocity, acceleration, *others, constant in affine.tolist():
+        # Behind the struts' forces and the applied one: forces that only an observer adds.
+        forces = others[: len(spec.struts) + 1]
+        by_height = [it / row for it in (position, velocity, acceleration)]
+        found.append([*by_height, *forces, constant - position * offset_m / row])
+    return found
 
 
 def _along_height(spec: ModelSpec, masses_kg: Sequence[float]) -> tuple[float, float]:

@@ -1,11 +1,13 @@
 """A model file written as an FMU."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, StrutSpec, dump_model
+from dart_model.virtual_sensors import VirtualSensor
 from rig.fmu.archive import archive
 from rig.fmu.component import Component, bench_component, strut_component
 from rig.fmu.source import VERSIONS
@@ -18,11 +20,13 @@ def export_fmu(
     strut: str | None,
     bench: bool,
     report_compiled: Callable[[str], None] = lambda _: None,
+    sensors: Mapping[str, VirtualSensor] = MappingProxyType({}),
 ) -> Component:
     """Write a strut, or the whole bench, as an FMU of version ``2.0`` or ``3.0``.
 
     The strut may be None where the model has only one. `report_compiled` is called with the name of
-    each system, once its binary is compiled. What was written is returned.
+    each system, once its binary is compiled. Virtual sensors are outputs of a bench. What was
+    written is returned.
 
     Raises:
         InputError: The file is there or cannot be written, there is no such version or strut, the
@@ -39,7 +43,7 @@ def export_fmu(
                 f"model {spec.name}: strut {item.name} has an FMU, expected one without: its force "
                 "cannot be part of another"
             )
-    component = bench_component(spec) if bench else strut_component(spec, struts[0])
+    component = bench_component(spec, sensors) if bench else strut_component(spec, struts[0])
     content = archive(
         component, fmi, dump_model(spec), done=lambda target: report_compiled(target.words)
     )

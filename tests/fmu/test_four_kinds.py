@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
+from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE
 from dart_model.plant import DartPlant, PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model
+from dart_model.virtual_sensors import VirtualSensor
 from rig.fmu.component import bench_component, strut_component
 from tests.fmu.driver import simulated, stepped, written
 from tests.fmu.specimens import DISPLACED_M, with_effects, worth
@@ -188,3 +190,36 @@ def test_a_law_switches_at_events_without_chatter(tmp_path, version, laws, most)
     heights, events = fmu_let_go(tmp_path, spec, version, "ModelExchange")
     assert np.abs(heights - let_go(spec, SHORT_S)).max() < 2e-6 * np.ptp(heights)
     assert 0 < events <= most
+
+
+SENSORS = {
+    "seat": VirtualSensor(acceleration_of="body"),
+    "place": VirtualSensor(position_of="body", at=(0.0, 0.0, 0.1)),
+    "speed": VirtualSensor(velocity_of="body", axis=(0.0, 0.0, -2.0)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("version", "kind"), KINDS)
+def test_virtual_sensors_are_outputs_and_read_what_the_plant_reads(tmp_path, version, kind):
+    spec = with_effects("cubic_stiffness")
+    path = written(tmp_path, bench_component(spec, SENSORS), version, spec)
+    assert validate_fmu(str(path)) == []
+    plant = DartPlant(spec)
+    reader, state, expected = plant.virtual_sensors(SENSORS), plant.init([DISPLACED_M]), []
+    for _ in range(301):
+        loaded = plant.load(state, (0.0,), (0.0,), 20.0)
+        expected.append(reader.read(loaded, (0.0,)))
+        state = plant.step(loaded, STEP_S, (0.0,))
+    starts = {"strut.height_m": DISPLACED_M}
+    for index, name in enumerate(
+        ("seat.acceleration_m_per_s2", "place.position_m", "speed.velocity_m_per_s")
+    ):
+        found, _ = simulated(path, kind, starts, name, 0.3, STEP_S)
+        assert found == pytest.approx(np.array(expected)[:, index], rel=1e-5, abs=1e-6)
+
+
+def test_a_sensor_of_a_strut_is_refused_for_an_fmu_that_has_its_outputs():
+    spec = with_effects("none")
+    with pytest.raises(InputError, match="has outputs of the struts already"):
+        bench_component(spec, {"power": VirtualSensor(power_of="strut")})
