@@ -115,7 +115,8 @@ class Loop:
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._no_inputs = (0.0,) * plant.inputs
-        self._law_n = plant.load(start, [0.0] * plant.struts, self._no_inputs, AMBIENT_C).forces_n
+        law_n = plant.load(start, [0.0] * plant.struts, self._no_inputs, AMBIENT_C).forces_n
+        self._law_n: Array = np.array(law_n)
         self._assumed = assumed or linearise_at(plant, heights_m)
         self._state = self._steady_state()
         parts = [
@@ -131,24 +132,25 @@ class Loop:
     def after(
         self,
         x: Array,
-        strut: int = 0,
-        noise_m: float = 0.0,
-        residual_n: float = 0.0,
+        noises_m: Sequence[float] | None = None,
+        residuals_n: Sequence[float] | None = None,
         bench_m: Sequence[float] | None = None,
         slopes: Sequence[tuple[float, float]] | None = None,
-    ) -> tuple[Array, float]:
-        """Numbers after the next measurement, and the error of a strut's published force.
+    ) -> tuple[Array, Array]:
+        """Numbers after the next measurement, and the errors of the published forces, (struts,).
 
         Args:
             x: Numbers after the last one.
-            strut: Index of the strut that noise and residual force are of.
-            noise_m: Noise of the measurement.
-            residual_n: Force that the bench's strut has and the model's lacks, over the interval;
-                the bench's motion is taken as given, and the model gets the force's opposite.
+            noises_m: Noise of each measurement; none if absent.
+            residuals_n: Force that each strut of the bench has and the model's lacks, over the
+                interval; the bench's motion is taken as given, and the model gets the forces'
+                opposite. None if absent.
             bench_m: Heights of the bench when the measurement was true; at rest if absent.
             slopes: Stiffness (N/m) and damping (N·s/m) of each strut's law that the observers know
                 of; those at the start if absent.
         """
+        nothing = [0.0] * self._plant.struts
+        noises_m, residuals_n = noises_m or nothing, residuals_n or nothing
         measured_m = self._heights_m if bench_m is None else bench_m
         numbers, observed, seen = (
             x[first:end].tolist() for first, end in itertools.pairwise(self._ends)
@@ -159,8 +161,10 @@ class Loop:
             state = self._observers.with_slopes(state, slopes)
         timing, count = self._timing, self._plant.struts
         for tick in range(1, timing.measured_every + 1):
-            acting = [of_strut.virtual_force_n for of_strut in state.struts]
-            acting[strut] -= residual_n
+            acting = [
+                of_strut.virtual_force_n - residual_n
+                for of_strut, residual_n in zip(state.struts, residuals_n, strict=True)
+            ]
             loaded = self._plant.load(model, acting, self._no_inputs, AMBIENT_C)
             model = self._plant.step(loaded, timing.period_ns * 1e-9, self._no_inputs)
             now = [height_m for height_m, _ in model.struts]
@@ -170,26 +174,31 @@ class Loop:
                 measured_ns = t_ns - timing.delay * timing.interval_ns
                 compared = seen[-count:] if timing.delay else now
                 innovations = [
-                    Innovation(
-                        bench_m - model_m + (noise_m if index == strut else 0.0), measured_ns
-                    )
-                    for index, (bench_m, model_m) in enumerate(
-                        zip(measured_m, compared, strict=True)
+                    Innovation(bench_m - model_m + noise_m, measured_ns)
+                    for bench_m, model_m, noise_m in zip(
+                        measured_m, compared, noises_m, strict=True
                     )
                 ]
                 seen = (now + seen)[: count * timing.delay]
             state = self._observers.step(state, t_ns, innovations)
-        law_n = self._plant.load(model, [0.0] * count, self._no_inputs, AMBIENT_C).forces_n[strut]
-        error_n = law_n - self._law_n[strut] + state.struts[strut].residual_force_n - residual_n
+        laws_n = self._plant.load(model, nothing, self._no_inputs, AMBIENT_C).forces_n
+        found_n = [of_strut.residual_force_n for of_strut in state.struts]
+        errors_n = np.array(laws_n) - self._law_n + found_n - residuals_n
         after = [*self._plant.numbers(model), *self._observers.numbers(state), *seen]
-        return np.array(after), error_n
+        return np.array(after), errors_n
 
     def linear(self, strut: int = 0, speed_m_per_s: float = USUAL_SPEED_M_PER_S) -> LinearLoop:
         """The loop about a motion at a speed, as one strut's noise and residual force drive it."""
-        size = len(self.at_rest)
+        return self.linear_each([strut], speed_m_per_s)[0]
+
+    def linear_each(
+        self, struts: Sequence[int], speed_m_per_s: float = USUAL_SPEED_M_PER_S
+    ) -> list[LinearLoop]:
+        """The loop as noise and residual force of each of some struts drive it."""
+        size, count, chosen = len(self.at_rest), self._plant.struts, list(struts)
+        own = np.diagonal(self._assumed.mobility_per_kg)[chosen]
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
-        mobility_per_kg = float(self._assumed.mobility_per_kg[strut, strut])
-        step_n = _ACCELERATION_STEP_M_PER_S2 / mobility_per_kg
+        widths += [_STEP] * len(chosen) + (_ACCELERATION_STEP_M_PER_S2 / own).tolist()
 
         def slopes_at(velocity_m_per_s: float) -> Array:
             moving, bench_m = self._moving(velocity_m_per_s)
@@ -197,15 +206,26 @@ class Loop:
             slopes = self._plant.slopes(model, self._no_inputs, AMBIENT_C)
 
             def after(u: Array) -> Array:
-                noise_m, residual_n = u[size:].tolist()
-                x = moving + u[:size]
-                return np.append(*self.after(x, strut, noise_m, residual_n, bench_m, slopes))
+                driven = np.zeros((2, count))
+                driven[:, chosen] = u[size:].reshape(2, -1)
+                noises_m, residuals_n = driven.tolist()
+                x, errors_n = self.after(moving + u[:size], noises_m, residuals_n, bench_m, slopes)
+                return np.append(x, errors_n[chosen])
 
-            return central_differences(after, [*widths, _STEP, step_n])
+            return central_differences(after, widths)
 
         slopes = 0.5 * (slopes_at(speed_m_per_s) + slopes_at(-speed_m_per_s))
-        a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
-        return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
+        drives = size + np.arange(2 * len(chosen)).reshape(2, -1).T
+        return [
+            LinearLoop(
+                slopes[:size, :size],
+                slopes[:size, drive],
+                slopes[size + place, :size],
+                slopes[size + place, drive],
+                self._timing.interval_ns * 1e-9,
+            )
+            for place, drive in enumerate(drives)
+        ]
 
     def _moving(self, speed_m_per_s: float) -> tuple[Array, list[float]]:
         """Numbers of a model that has followed a motion, and the bench's heights then measured."""

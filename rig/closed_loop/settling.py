@@ -39,14 +39,14 @@ def settling_times_ns(
 ) -> list[int | None]:
     """Settling time of each strut's estimate, about rest at some heights; None if it never does."""
     loop = Loop(plant, observers, heights_m, timing)
-    decays_ns = [
-        decay_time_ns(loop.linear(strut)) if observer.estimates_force else 0
-        for strut, observer in enumerate(observers)
-    ]
-    return [
-        None if decay_ns is None else observer.settling_ns(decay_ns)
-        for observer, decay_ns in zip(observers, decays_ns, strict=True)
-    ]
+    times_ns: list[int | None] = [0] * len(observers)
+    observed = [strut for strut, observer in enumerate(observers) if observer.estimates_force]
+    if not observed:
+        return times_ns
+    for strut, linear in zip(observed, loop.linear_each(observed), strict=True):
+        decay_ns = decay_time_ns(linear)
+        times_ns[strut] = None if decay_ns is None else observers[strut].settling_ns(decay_ns)
+    return times_ns
 
 
 def decay_time_ns(loop: LinearLoop) -> int | None:

@@ -110,6 +110,13 @@ _WIDEST_OF_RATE = 1.0 / 3.0
 """Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
 
 
+DAMPING = 0.8
+"""Damping ratio of the feedback: settles fast, hardly overshoots."""
+
+MOST_PER_INTERVAL = 0.3
+"""Largest product of the feedback's corner and the time between two measurements: the hold of the
+virtual force takes half an interval of phase."""
+
 CONTRADICTION = 8.0**2
 """Square of what is new in a measurement behind a gap over its variance, from which it contradicts
 what is known: another zero, or a motion that the gap hid. Once in 1e15 for normal errors."""

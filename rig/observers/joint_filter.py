@@ -14,7 +14,7 @@ leave the sensor out until as many are within again. A drift within the gate is 
 reference that jumps is a case for the limits.
 
 The virtual force of an observed strut is its residual force, and a feedback that lets the errors of
-the observed heights decay as if each were alone.
+all measured heights decay as if each were alone; that of a strut with a known law is this feedback.
 
 References:
     Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001),
@@ -36,6 +36,8 @@ from numpy.typing import NDArray
 from rig.channels.measured_quantities import HEIGHT
 from rig.observers.error_filter import (
     CONTRADICTION,
+    DAMPING,
+    MOST_PER_INTERVAL,
     STEADY_VARIANCE,
     inputs_since,
     scale_fading,
@@ -101,7 +103,7 @@ class JointState(Struct, frozen=True, gc=False):
     Attributes:
         point: What is known at the last reading.
         motion: How the error moves where the model is now.
-        inputs: Virtual forces, as far back as `used`.
+        inputs: Virtual forces of the followed struts, as far back as `used`.
         used: What was used lately, the oldest first.
         references: Of each strut.
         health: Of each further sensor, by its channel.
@@ -134,16 +136,14 @@ class JointFilter:
         self._oldest_ns = latest_ns + model.interval_ns
         self._longest_ns = model.delay_ns + 2 * model.interval_ns + round(1e9 / model.fastest)
         self._fadings = {
-            strut: scale_fading(model.starts[strut].interval_ns) for strut in model.heights_std_m
+            strut: scale_fading(model.starts[strut].interval_ns) for strut in model.followed
         }
-        observed = model.observed
-        self._places = {strut: place for place, strut in enumerate(model.own)}
-        self._limits_n = np.array([item.force_limit_n for item in observed])
-        corner, damping = np.array([(item.corner, item.damping) for item in observed]).T
-        stiffness, rates = corner**2, 2.0 * damping * corner
-        wanted = stiffness[:, None] * model.own_heights + rates[:, None] * model.own_rates
-        self._required = model.decoupling @ wanted
-        self._required[:, model.forces] += np.eye(len(observed))
+        self._struts = struts = list(model.followed)
+        self._places = {strut: place for place, strut in enumerate(struts)}
+        self._limits_n = np.array([item.force_limit_n for item in model.followed.values()])
+        corner = min(model.fastest, MOST_PER_INTERVAL * 1e9 / model.interval_ns)
+        wanted = corner**2 * model.heights[struts] + 2.0 * DAMPING * corner * model.rates[struts]
+        self._required = model.forces_by_accelerations(struts) @ wanted + model.residuals[struts]
 
     def init(self, t_ns: int) -> JointState:
         """State at the model's start, at the first measured heights."""
@@ -169,7 +169,7 @@ class JointFilter:
     def _begin(self, t_ns: int, covariance: Array) -> JointState:
         model = self._model
         point = Point(t_ns, np.zeros(model.size), covariance)
-        inputs = ((t_ns, np.zeros(len(model.own))),)
+        inputs = ((t_ns, np.zeros(len(model.followed))),)
         references = tuple(Reference(start.t_ns, start.t_ns) for start in model.starts)
         health = {channel: SensorHealth(t_ns) for channel in self._sensors}
         lag = model.lag.init(t_ns)
@@ -247,7 +247,8 @@ class JointFilter:
             before = replace(before, covariance=before.covariance + model.prior())
             after, _, _ = self._update(state, before, item, strut)
             return after, Reference(item.t_ns, item.t_ns, item.value, scale)
-        new_m = new * math.sqrt(model.innovations[strut] / variance) * model.heights_std_m[strut]
+        noise_m = model.followed[strut].noise_std_m
+        new_m = new * math.sqrt(model.innovations[strut] / variance) * noise_m
         scale = update_scale(scale, self._fadings[strut], new * new / variance)
         t_ns, measured_ns = max(known.t_ns, item.t_ns), max(known.measured_ns, item.t_ns)
         return after, Reference(t_ns, measured_ns, item.value, scale, new_m)
@@ -300,7 +301,7 @@ class JointFilter:
         number = model.grid_index(t_ns) - model.grid_index(point.t_ns)
         covariance = model.force_covariance(model.ahead(point.covariance, number))
         is_disturbed = np.diagonal(covariance) > STEADY_VARIANCE * model.usual_n2
-        is_disturbed[model.own] |= np.abs(virtual_n) >= limits_n
+        is_disturbed[self._struts] |= np.abs(virtual_n) >= limits_n
         scales = np.array([reference.scale for reference in state.references])
         covariance = covariance * np.sqrt(np.outer(scales, scales))
         own = model.own
@@ -367,7 +368,7 @@ class JointFilter:
         mean, forces = self._model.of_numbers(numbers)
         since = [since_ns for since_ns, _ in state.inputs]
         struts = list(state.struts)
-        for strut, force_n in zip(self._model.own, forces[-1].tolist(), strict=True):
+        for strut, force_n in zip(self._struts, forces[-1].tolist(), strict=True):
             struts[strut] = replace(struts[strut], virtual_force_n=force_n)
         return replace(
             state,

@@ -10,7 +10,7 @@ that can be in balance with one another: their variances would grow without a bo
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from rig.observers.strut_sensors import STRUT_SENSORS, StrutErrors
 
 Array = NDArray[np.float64]
 Inputs = tuple[tuple[int, Array], ...]
-"""Virtual forces of the observed struts, and from when on; the oldest first."""
+"""Virtual forces of the followed struts, and from when on; the oldest first."""
 
 STATES = 3
 """Of a residual force, as in `rig.observers.error_filter`."""
@@ -55,22 +55,20 @@ _ORDER = 5
 """Order of the Taylor series of the mean; exact where the model's own laws do nothing."""
 
 
-class ObservedStrut(NamedTuple):
-    """A strut whose residual force is estimated.
+class FollowedStrut(NamedTuple):
+    """A strut whose height the model follows.
 
     Attributes:
         strut: Its index.
-        filter: Bandwidth of the residual force, and noise of the height.
+        noise_std_m: Standard deviation of its height.
+        filter: Bandwidth of its residual force; None where its law is known.
         force_limit_n: Largest magnitude of its virtual force.
-        corner: Of the feedback, in rad/s.
-        damping: Damping ratio of the feedback.
     """
 
     strut: int
-    filter: ErrorFilter
+    noise_std_m: float
+    filter: ErrorFilter | None
     force_limit_n: float
-    corner: float
-    damping: float
 
 
 class Motion(NamedTuple):
@@ -101,23 +99,20 @@ class JointModel:
     Args:
         model: Motion of the model.
         starts: Start of each strut.
-        observed: Struts whose residual forces are estimated.
-        heights_std_m: Standard deviation of the heights that are used, by strut: of every observed
-            one, and of others whose laws are known.
+        followed: Struts whose heights are followed, one at least with a residual force.
 
     Attributes:
-        own: Indices of the observed struts.
+        followed: These, by their indices.
+        own: Indices of the observed struts: those whose residual forces are estimated.
         size: Length N of the state.
         forces: Where the residual forces are in the state.
         interval_ns: Time between two heights of the strut that is measured least often.
         delay_ns: Largest delay of these heights.
         fastest: Corner of the fastest residual force in rad/s.
-        mobility_per_kg: Of the observed struts.
         units: Of the state, so that all variances are of one size.
-        decoupling: Forces of the observed struts (N) by accelerations of their heights.
         residuals: Residual force of each strut by the state, shape (struts, N).
-        own_heights: Of the observed struts by the state, shape (observed, N).
-        own_rates: The same of their rates.
+        heights: Height of each strut by the state, shape (struts, N).
+        rates: Its rate by the state.
         motion: Motion where the filter begins: that of its variances everywhere.
         lines: What is read, by channel and strut.
         steady: Covariance in units after a long time with every height at its interval.
@@ -130,57 +125,63 @@ class JointModel:
         self,
         model: ErrorModel,
         starts: Sequence[Start],
-        observed: Sequence[ObservedStrut],
-        heights_std_m: Mapping[int, float],
+        followed: Sequence[FollowedStrut],
     ) -> None:
-        self._model, self.starts, self.observed = model, tuple(starts), tuple(observed)
-        self.heights_std_m = dict(heights_std_m)
-        self.own = [item.strut for item in observed]
+        self._model, self.starts = model, tuple(starts)
+        self.followed = {item.strut: item for item in followed}
+        self._filters = {it.strut: it.filter for it in followed if it.filter is not None}
+        self.own = list(self._filters)
         self._n = n = len(model.by_force)
         count = len(self.own)
         self.size = 2 * n + STATES * count
         self.forces = slice(2 * n, 2 * n + count)
-        used = [self.starts[strut] for strut in heights_std_m]
+        used = [self.starts[strut] for strut in self.followed]
         self.interval_ns = max(start.interval_ns for start in used)
         self.delay_ns = max(start.delay_ns for start in used)
-        self.fastest = max(item.filter.omega for item in observed)
-        self._unit_m, self._unit_s = min(heights_std_m.values()), 1.0 / self.fastest
-        self.mobility_per_kg = np.array([starts[strut].mobility_per_kg for strut in self.own])
+        self.fastest = max(item.omega for item in self._filters.values())
+        self._unit_m = min(item.noise_std_m for item in followed)
+        self._unit_s = 1.0 / self.fastest
         self.units = self._make_units()
-        together = model.mobility_per_kg[np.ix_(self.own, self.own)]
-        self.decoupling: Array = np.asarray(np.linalg.pinv(together, rcond=1e-9), np.float64)
         none = np.zeros((len(model.heights), self.size))
-        heights, rates, self.residuals = none.copy(), none.copy(), none.copy()
-        heights[:, :n], rates[:, n : 2 * n] = model.heights, model.heights
+        self.heights, self.rates, self.residuals = none.copy(), none.copy(), none.copy()
+        self.heights[:, :n], self.rates[:, n : 2 * n] = model.heights, model.heights
         self.residuals[self.own, np.arange(count) + 2 * n] = 1.0
         force_errors = self.residuals.copy()
         force_errors[:, : 2 * n] = model.laws
-        self.own_heights, self.own_rates = heights[self.own], rates[self.own]
         self._scaled_forces = force_errors * self.units
-        self._push = np.zeros((self.size, count))
-        self._push[n : 2 * n] = -model.by_force[:, self.own]
+        self._push = np.zeros((self.size, len(self.followed)))
+        self._push[n : 2 * n] = -model.by_force[:, list(self.followed)]
         self.motion = self.motion_with(model.laws)
-        errors = zip(heights, rates, force_errors, strict=True)
+        errors = zip(self.heights, self.rates, force_errors, strict=True)
         self.lines = self._make_lines([StrutErrors(*of_strut) for of_strut in errors])
         self._density = self._make_density()
         self._transitions: dict[int, tuple[Array, Array]] = {}
         self.steady, gains, innovations = self._find_steady()
-        self.innovations = dict(zip(heights_std_m, np.diagonal(innovations).tolist(), strict=True))
+        variances = np.diagonal(innovations).tolist()
+        self.innovations = dict(zip(self.followed, variances, strict=True))
         late = 1 + round(self.delay_ns / self.interval_ns)
         self.usual_n2 = np.diagonal(self.force_covariance(self.ahead(self.steady, late * _GRID)))
         self.lag = self._make_lag(gains, innovations)
 
     def _make_units(self) -> Array:
         of_rate = self._unit_m / self._unit_s
-        of_force = of_rate / self._unit_s / self.mobility_per_kg
+        of_force = of_rate / self._unit_s / self._mobilities_per_kg(self.own)
         of_forces = [of_force / self._unit_s**power for power in range(STATES)]
         of_motion = np.repeat([self._unit_m, of_rate], self._n)
         return np.concatenate([of_motion, *of_forces])
 
+    def _mobilities_per_kg(self, struts: Sequence[int]) -> Array:
+        return np.array([self.starts[strut].mobility_per_kg for strut in struts])
+
+    def forces_by_accelerations(self, struts: Sequence[int]) -> Array:
+        """Forces in some struts (N) by accelerations of their heights (m/s²)."""
+        together = self._model.mobility_per_kg[np.ix_(struts, struts)]
+        return np.asarray(np.linalg.pinv(together, rcond=1e-9), np.float64)
+
     def _make_lines(self, errors: Sequence[StrutErrors]) -> dict[tuple[int, int], Line]:
         found = {
-            (REFERENCE_HEIGHT, strut): (errors[strut].height, std_m)
-            for strut, std_m in self.heights_std_m.items()
+            (REFERENCE_HEIGHT, strut): (errors[strut].height, item.noise_std_m)
+            for strut, item in self.followed.items()
         }
         for strut, start in enumerate(self.starts):
             for channel in start.sensors:
@@ -198,7 +199,7 @@ class JointModel:
         generator[n : 2 * n, self.forces] = self._model.by_force[:, self.own]
         forces = generator[2 * n :, 2 * n :]
         forces[:] = np.eye(STATES * count, k=count)
-        forgetting = [_FORGETTING * item.filter.omega for item in self.observed]
+        forgetting = [_FORGETTING * item.omega for item in self._filters.values()]
         np.fill_diagonal(forces, np.negative(forgetting * STATES))
         stiffness, damping = (np.abs(part).sum(axis=1).max() for part in np.hsplit(motion, 2))
         return Motion(laws, generator, max(math.sqrt(stiffness), float(damping)))
@@ -216,16 +217,16 @@ class JointModel:
         That of one strut alone gives a Butterworth filter (`rig.observers.error_filter`).
         """
         density = np.zeros(self.size)
-        for place, item in enumerate(self.observed, self.size - len(self.observed)):
-            interval_s = self.starts[item.strut].interval_ns * 1e-9
-            of_acceleration = item.filter.noise_std_m**2 * item.filter.omega**10 * interval_s
+        for place, (strut, item) in enumerate(self._filters.items(), self.size - len(self.own)):
+            interval_s = self.starts[strut].interval_ns * 1e-9
+            of_acceleration = item.noise_std_m**2 * item.omega**10 * interval_s
             density[place] = of_acceleration * self._unit_s**9 / self._unit_m**2
         return np.diag(density)
 
     def _find_steady(self) -> tuple[Array, Array, Array]:
         """Steady covariance and gains after all heights, in units, and innovations' covariance."""
         transition, noise = self._transition(_GRID)
-        struts = list(self.heights_std_m)
+        struts = list(self.followed)
         rows = np.array([self.lines[REFERENCE_HEIGHT, strut].scaled for strut in struts])
         often = np.array([self.interval_ns / self.starts[strut].interval_ns for strut in struts])
         ahead = limit_ahead(transition, noise, rows.T @ (often[:, None] * rows))
@@ -236,9 +237,9 @@ class JointModel:
         return 0.5 * (after + after.T), gains, innovations
 
     def _make_lag(self, gains: Array, innovations: Array) -> JointLagFilter:
-        stds_m = np.array(list(self.heights_std_m.values()))
+        stds_m = np.array([item.noise_std_m for item in self.followed.values()])
         in_si = self.units[:, None] * gains / stds_m
-        struts = list(self.heights_std_m)
+        struts = list(self.followed)
         n, interval_s = self._n, self.interval_ns * 1e-9
         # What the model itself answers to an error of its heights.
         coordinates = np.linalg.pinv(self._model.heights[struts], rcond=1e-9)
@@ -247,26 +248,30 @@ class JointModel:
         by_error, by_rate = own[:, :n] @ coordinates, own[:, n:] @ coordinates
         is_own = np.array([[float(strut == own) for strut in struts] for own in self.own])
         return JointLagFilter(
-            [item.filter.omega for item in self.observed],
+            [item.omega for item in self._filters.values()],
             interval_s,
-            (self.own_heights @ in_si - by_rate, self.own_rates @ in_si - by_error, is_own),
-            self.decoupling,
+            (
+                self.heights[self.own] @ in_si - by_rate,
+                self.rates[self.own] @ in_si - by_error,
+                is_own,
+            ),
+            self.forces_by_accelerations(self.own),
             innovations * np.outer(stds_m, stds_m),
         )
 
     def prior(self) -> Array:
         """Covariance in units before anything was measured but the heights at the start."""
-        n, struts = self._n, list(self.heights_std_m)
+        n, struts = self._n, list(self.followed)
         rows = self._model.heights[struts]
         spread = np.linalg.pinv(rows, rcond=1e-9)
         unseen = np.eye(n) - spread @ rows
-        heights_m2 = np.square(list(self.heights_std_m.values()))
+        heights_m2 = np.square([item.noise_std_m for item in self.followed.values()])
         prior = np.zeros((self.size, self.size))
         positions, rates = prior[:n, :n], prior[n : 2 * n, n : 2 * n]
         positions[:] = spread @ np.diag(heights_m2) @ spread.T + _UNMEASURED_STD_M**2 * unseen
         rates[:] = RATE_STD_M_PER_S**2 * spread @ spread.T + _UNMEASURED_STD_M_PER_S**2 * unseen
-        corners = np.array([item.filter.omega for item in self.observed])
-        forces_n = ACCELERATION_STD_M_PER_S2 / self.mobility_per_kg
+        corners = np.array([item.omega for item in self._filters.values()])
+        forces_n = ACCELERATION_STD_M_PER_S2 / self._mobilities_per_kg(self.own)
         stds = np.concatenate([forces_n * corners**power for power in range(STATES)])
         np.fill_diagonal(prior[2 * n :, 2 * n :], stds**2)
         return prior / np.outer(self.units, self.units)
@@ -325,15 +330,15 @@ class JointModel:
 
     def numbers(self, mean: Array, forces_n: Sequence[Array]) -> list[float]:
         """State and virtual forces as numbers of one size, all in m."""
-        per_force = self.mobility_per_kg * self._unit_s**2
+        per_force = self._mobilities_per_kg(list(self.followed)) * self._unit_s**2
         parts = [mean * (self._unit_m / self.units), *(force_n * per_force for force_n in forces_n)]
         return np.concatenate(parts).tolist()
 
     def of_numbers(self, numbers: Sequence[float]) -> tuple[Array, list[Array]]:
         """State and virtual forces that `numbers` returned."""
         mean = np.array(numbers[: self.size]) * (self.units / self._unit_m)
-        per_force = self.mobility_per_kg * self._unit_s**2
-        forces = np.array(numbers[self.size :]).reshape(-1, len(self.own)) / per_force
+        per_force = self._mobilities_per_kg(list(self.followed)) * self._unit_s**2
+        forces = np.array(numbers[self.size :]).reshape(-1, len(self.followed)) / per_force
         return mean, list(forces)
 
 

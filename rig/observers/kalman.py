@@ -25,9 +25,8 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from can_dbc.yaml_file import Positive
-from rig.observers.error_filter import ErrorFilter, ErrorState
+from rig.observers.error_filter import DAMPING, MOST_PER_INTERVAL, ErrorFilter, ErrorState
 from rig.observers.filter_lag import NO_LAG
-from rig.observers.joint_model import ObservedStrut
 from rig.observers.protocol import (
     AnyObserver,
     Innovation,
@@ -38,13 +37,6 @@ from rig.observers.protocol import (
     TuningTask,
     Vector,
 )
-
-_DAMPING = 0.8
-"""Damping ratio of the feedback: settles fast, hardly overshoots."""
-
-_MOST_PER_INTERVAL = 0.3
-"""Largest product of the feedback's corner and the time between two measurements: the hold of the
-virtual force takes half an interval of phase."""
 
 _GAIN_MARGIN = 1.1
 """The residual force is cancelled with the effective mass that the model itself gives, which is
@@ -112,15 +104,6 @@ class KalmanObserver:
     def height_std_m(self) -> float:
         return self.filter.noise_std_m
 
-    def observed(self, strut: int, start: Start) -> ObservedStrut:
-        """The strut of an index, as a joint filter observes it."""
-        corner = self._corner(start)
-        return ObservedStrut(strut, self.filter, self.force_limit_n, corner, _DAMPING)
-
-    def _corner(self, start: Start) -> float:
-        """Corner of the feedback in rad/s."""
-        return min(self.filter.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
-
     def init(self, start: Start) -> KalmanState:
         return self._initial(self.filter.init(start), start)
 
@@ -147,8 +130,8 @@ class KalmanObserver:
         mobility_per_kg = start.mobility_per_kg
         mean = follower.predict(error, t_ns)
         x, v, a, _, _ = mean
-        corner = self._corner(start)
-        required = a + corner * corner * x + 2.0 * _DAMPING * corner * v
+        corner = min(self.filter.omega, MOST_PER_INTERVAL * 1e9 / start.interval_ns)
+        required = a + corner * corner * x + 2.0 * DAMPING * corner * v
         force_n = min(max(required / mobility_per_kg, -limit_n), limit_n)
         std_n = follower.residual_std(error, t_ns) / mobility_per_kg
         residual_n = follower.residual(error, mean) / mobility_per_kg

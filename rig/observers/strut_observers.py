@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from rig.observers.error_model import ErrorModel
 from rig.observers.joint_filter import JointFilter, JointState
-from rig.observers.joint_model import JointModel
+from rig.observers.joint_model import FollowedStrut, JointModel
 from rig.observers.kalman import KalmanObserver
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 
@@ -146,13 +146,18 @@ class StrutObservers:
         }
         if not any(model.moves_another(strut) or starts[strut].sensors for strut in own):
             return None
-        observed = [observer.observed(strut, starts[strut]) for strut, observer in own.items()]
-        heights_std_m = {
-            strut: observer.height_std_m
+        largest_n = max(observer.force_limit_n for observer in own.values())
+        followed = [
+            FollowedStrut(
+                strut,
+                observer.height_std_m,
+                own[strut].filter if strut in own else None,
+                observer.force_limit_n or largest_n,
+            )
             for strut, observer in enumerate(self.each)
             if observer.height_std_m is not None
-        }
-        return JointFilter(JointModel(model, starts, observed, heights_std_m))
+        ]
+        return JointFilter(JointModel(model, starts, followed))
 
     def _join(self, struts: Sequence[ObserverState], joint: JointState | None) -> ObserversState:
         """State with what the joint filter says of the struts that it knows."""

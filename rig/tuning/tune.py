@@ -1,10 +1,12 @@
 """From a configuration and a run to a configuration with tuned observers."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
+
+import numpy as np
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
 from can_dbc.codec import si_step
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text
+from dart_model.errors import ModelError
 from dart_model.protocol import AnyPlant
 from rig.channels.channel import Channel
 from rig.closed_loop.loop import SampleTiming
@@ -30,7 +33,6 @@ from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
 from rig.run.replay import replay
 from rig.tuning.expectation import (
-    Array,
     Expectation,
     expectation_from_noise,
     expectations_from_run,
@@ -103,10 +105,10 @@ def tune(
         raise InputError(
             f"{plan.source}: prescribed_motion: no loop is closed, expected a free model"
         )
-    if not all(strut.observer.estimates_force for strut in plan.struts):
+    observed = [i for i, strut in enumerate(plan.struts) if strut.observer.estimates_force]
+    if not observed:
         raise InputError(
-            f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
-            "an observer of each strut"
+            f"{plan.source}: observers: kind none of every strut, expected an observer to tune"
         )
     if isinstance(source, StatedExpectation) and source.up_to_hz >= 0.5e9 / plan.period_ns:
         raise InputError(
@@ -120,18 +122,18 @@ def tune(
     steps = read_run(source).steps if isinstance(source, Path) else None
     points = [OperatingPoint(at_rest_m, FAST_SPEED_M_PER_S)]
     if steps is not None:
-        points = operating_points(steps, plan.strut_names) or points
-    mobility = assumed.mobility_per_kg
-    expectations = _expectations(plan, source, steps, mobility)
-    loops = _Loops(plan, plant, assumed, mobility, points, expectations)
+        found = operating_points(steps, plan.strut_names)
+        points = [point for point in found if _is_reached(plant, point)] or points
+    expectations = _expectations(plan, source, steps, observed, assumed)
+    loops = _Loops(plan, plant, assumed, points, expectations)
     if isinstance(source, Path) and (recorded := plan_of_run(source)).model != plan.model:
         progress("the run with this model", 0.0)
         loops = _follow_with_own_model(loops, recorded, source, aim)
     tuned: list[TunedStrut] = []
     progress("latency", 0.0)
-    latencies = _latencies(plan, source)
-    for index, (strut, latency) in enumerate(zip(plan.struts, latencies, strict=True)):
-        share = index / len(plan.struts), (index + 1) / len(plan.struts)
+    latencies = _latencies(plan, source, observed)
+    for number, (index, latency) in enumerate(zip(observed, latencies, strict=True)):
+        strut, share = plan.struts[index], (number / len(observed), (number + 1) / len(observed))
         part = within(progress, *share, of=strut.name)
         delay_s = _delay_s(plan, strut.name, latency)
         problem = loops.problem(index, delay_s)
@@ -156,24 +158,34 @@ def tune(
     return tuned
 
 
+def _is_reached(plant: AnyPlant, point: OperatingPoint) -> bool:
+    """Whether a model has such heights: those of more struts than coordinates need not agree."""
+    try:
+        plant.init(point.heights_m)
+    except ModelError:
+        return False
+    return True
+
+
 def _expectations(
     plan: Plan,
     source: Path | StatedExpectation,
     steps: "pa.Table | None",
-    mobility_per_kg: Array,
-) -> list[Expectation]:
-    """What the observers have to expect, from the steps of a run or as stated.
-
-    The mobilities are the acceleration of each height per newton in each strut.
-    """
-    if steps is not None and isinstance(source, Path):
-        return expectations_from_run(steps, source, plan.strut_names, mobility_per_kg)
+    observed: Sequence[int],
+    assumed: ErrorModel,
+) -> dict[int, Expectation]:
+    """What the observers of some struts have to expect, from the steps of a run or as stated."""
+    names = [plan.strut_names[index] for index in observed]
     found: list[Expectation] = []
-    for height in plan.heights:
-        if isinstance(source, StatedExpectation):
-            noise_std_m = source.noise_std_m or _quantisation_m(height)
+    if steps is not None and isinstance(source, Path):
+        together = assumed.mobility_per_kg[np.ix_(observed, observed)]
+        found = expectations_from_run(steps, source, names, together)
+    elif isinstance(source, StatedExpectation):
+        heights = {height.name: height for height in plan.heights}
+        for name in names:
+            noise_std_m = source.noise_std_m or _quantisation_m(heights[name])
             found.append(expectation_from_noise(noise_std_m, source.rms_n, source.up_to_hz))
-    return found
+    return dict(zip(observed, found, strict=True))
 
 
 def _follow_with_own_model(loops: "_Loops", recorded: Plan, run: Path, aim: Aim) -> "_Loops":
@@ -184,11 +196,14 @@ def _follow_with_own_model(loops: "_Loops", recorded: Plan, run: Path, aim: Aim)
     plan = loops.plan
     followers = {
         strut.name: tune_observer(loops.problem(index, 0.0), "kalman", aim).observer
+        if index in loops.expectations
+        else strut.observer
         for index, strut in enumerate(plan.struts)
     }
     own = recorded.with_model(plan.model).with_observers(followers)
-    steps = replay(run, plan=own).steps
-    return loops._replace(expectations=_expectations(plan, run, steps, loops.mobility_per_kg))
+    steps, observed = replay(run, plan=own).steps, list(loops.expectations)
+    found = _expectations(plan, run, steps, observed, loops.assumed)
+    return loops._replace(expectations=found)
 
 
 class _Loops(NamedTuple):
@@ -198,24 +213,24 @@ class _Loops(NamedTuple):
         plan: The configuration.
         plant: Its model.
         assumed: Motion that the observers take the model to have.
-        mobility_per_kg: Acceleration of each height per newton in each strut, (struts, struts).
         points: Motions in which the loops have to be stable.
-        expectations: What the observer of each strut has to expect.
+        expectations: What the observer of each strut has to expect that is tuned, by its index.
     """
 
     plan: Plan
     plant: AnyPlant
     assumed: ErrorModel
-    mobility_per_kg: Array
     points: Sequence[OperatingPoint]
-    expectations: Sequence[Expectation]
+    expectations: Mapping[int, Expectation]
 
     def problem(self, index: int, delay_s: float) -> TuningProblem:
         """What is to be tuned of a strut whose height has a delay."""
         struts = self.plan.struts
         others = tuple(
-            KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
-            for item, strut in zip(self.expectations, struts, strict=True)
+            KalmanObserver.before_tuning(self.expectations[number].noise_std_m, strut.interval_ns)
+            if number in self.expectations
+            else strut.observer
+            for number, strut in enumerate(struts)
         )
         return TuningProblem(
             self.plant,
@@ -230,13 +245,21 @@ class _Loops(NamedTuple):
         )
 
 
-def _latencies(plan: Plan, source: Path | StatedExpectation) -> list[Latency | None]:
-    """Latencies of the heights as the run shows them; None where there is none, or one is given."""
-    given_s = [plan.config.signals.height[strut].delay_s for strut in plan.strut_names]
-    if not isinstance(source, Path) or all(given_s):
+def _latencies(
+    plan: Plan, source: Path | StatedExpectation, observed: Sequence[int]
+) -> list[Latency | None]:
+    """Latencies of the observed heights as the run shows them; None where one is given.
+
+    None, too, where there is no run, or where the height of a strut is not measured.
+    """
+    heights = plan.config.signals.height
+    given_s = [heights[plan.strut_names[index]].delay_s for index in observed]
+    is_measured = all(name in heights for name in plan.strut_names)
+    if not isinstance(source, Path) or all(given_s) or not is_measured:
         return [None] * len(given_s)
     found = estimate_latencies(source, plan.model, plan.strut_names)
-    return [None if given else latency for given, latency in zip(given_s, found, strict=True)]
+    chosen = [found[index] for index in observed]
+    return [None if given else latency for given, latency in zip(given_s, chosen, strict=True)]
 
 
 def _delay_s(plan: Plan, strut: str, latency: Latency | None) -> float:
@@ -264,8 +287,12 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path, model: str | N
         raise InputError(
             f"--out {path}: expected a file in the folder of {plan.source}, whose files it names"
         )
+    observers = {strut.name: strut.tuned.observer for strut in tuned}
     top: dict[str, object] = {
-        "observers": {strut.name: settings_of(strut.tuned.observer) for strut in tuned}
+        "observers": {
+            strut.name: settings_of(observers.get(strut.name, strut.observer))
+            for strut in plan.struts
+        }
     }
     if model is not None:
         is_file = Path(model).exists()

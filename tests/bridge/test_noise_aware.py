@@ -151,14 +151,14 @@ def test_noise_and_lag_of_the_linear_loop_are_those_of_the_simulated_one(observe
     rng = np.random.default_rng(5)
     x, errors = loop.at_rest, []
     for _ in range(12_000):
-        x, error_n = loop.after(x, 0, 2e-5 * rng.standard_normal())
+        x, (error_n,) = loop.after(x, [2e-5 * rng.standard_normal()])
         errors.append(error_n)
     simulated = np.std(errors[2000:])
     assert linear.noise_gain_n_per_m() * 2e-5 == pytest.approx(simulated, rel=0.1)
     x, errors = loop.at_rest, []
     frequency_hz = 4.0
     for tick in range(6000):
-        x, error_n = loop.after(x, 0, 0.0, np.sin(2.0 * np.pi * frequency_hz * tick * 1e-3))
+        x, (error_n,) = loop.after(x, None, [np.sin(2.0 * np.pi * frequency_hz * tick * 1e-3)])
         errors.append(error_n)
     amplitude = np.sqrt(2.0) * np.std(errors[-1000:])
     assert linear.lag_gain(np.array([frequency_hz]))[0] == pytest.approx(amplitude, rel=0.02)

@@ -87,7 +87,7 @@ def test_after_the_settling_time_a_step_of_the_residual_force_leaves_a_hundredth
     loop = Loop(plant, (observer,), (REFERENCE_REST_M,), SampleTiming(MS, every))
     x, errors_n = loop.at_rest, []
     for _ in range(4000):
-        x, error_n = loop.after(x, 0, 0.0, 1.0)
+        x, (error_n,) = loop.after(x, None, [1.0])
         errors_n.append(abs(error_n))
     last = int(np.flatnonzero(np.array(errors_n) > 0.01)[-1])
     assert errors_n[-1] < 1e-3

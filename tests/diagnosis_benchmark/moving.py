@@ -203,19 +203,32 @@ def _columns(case: MovingCase, duration_s: float, seed: int) -> Iterator[tuple[s
 
 
 def moving_ratios(case: MovingCase) -> tuple[float, ...]:
-    """RMS force of each effect, alone in the bench, over that of the noise."""
-    struts = {strut.name: (index, strut) for index, strut in enumerate(case.bench.struts)}
+    """RMS force of each effect in the run that is diagnosed, over that of the noise."""
+    course = _simulated(_moved(case.bench, 2 * case.seed + 1), TRAIN_S)
+    columns = {strut.name: index for index, strut in enumerate(case.bench.struts)}
+    floor_n = force_noise_floor_n(case)
     found: list[float] = []
     for effect in case.effects:
-        alone = case.bench.model_copy(update={"undeclared_effects": (effect,)})
-        course = _simulated(_moved(alone, 2 * case.seed + 1), TRAIN_S)
-        index, strut = struts[effect.strut]
-        height, velocity = course.height_m[:, index], course.velocity_m_per_s[:, index]
-        own = np.interp(height, strut.spring.height_m, strut.spring.force_n)
-        own = own + np.interp(velocity, strut.damper.velocity_m_per_s, strut.damper.force_n)
-        force_n = course.strut_force_n[:, index] - own
-        found.append(float(np.sqrt(np.mean(force_n**2))) / force_noise_floor_n(case))
+        column = columns[effect.strut]
+        height, velocity = course.height_m[:, column], course.velocity_m_per_s[:, column]
+        force_n = _force_n(effect, height - FREE_M[case.kind], height, velocity)
+        found.append(float(np.sqrt(np.mean(force_n**2))) / floor_n)
     return tuple(found)
+
+
+def _force_n(effect: UndeclaredEffect, travel_m, height_m, velocity_m_per_s):
+    """Force of an effect along a motion, without its sign."""
+    values = effect.parameters
+    match effect.name:
+        case "friction":
+            return np.full_like(height_m, values["coulomb_force_n"])
+        case "cubic_stiffness":
+            return values["stiffness_n_per_m3"] * travel_m**3
+        case "quadratic_damping":
+            return values["damping_n_s2_per_m2"] * velocity_m_per_s**2
+        case _:
+            depth_m = np.maximum(values["contact_height_m"] - height_m, 0.0)
+            return values["contact_stiffness_n_per_m1_5"] * depth_m**1.5
 
 
 def force_noise_floor_n(case: MovingCase) -> float:

@@ -15,8 +15,7 @@ from rig.closed_loop.loop import Loop, SampleTiming
 from rig.closed_loop.strut_response import linearise_at
 from rig.observers import OBSERVERS
 from rig.observers.joint_filter import JointFilter
-from rig.observers.joint_model import JointModel
-from rig.observers.kalman import KalmanObserver
+from rig.observers.joint_model import FollowedStrut, JointModel
 from rig.observers.protocol import REFERENCE_HEIGHT, Innovation, Start
 from rig.observers.strut_observers import ObserversState, StrutObservers
 
@@ -61,10 +60,12 @@ def starts_of(model, sensors=((), ()), interval_ns=MS, delay_ns=0):
 def joint_of(model, kinds=("kalman", "kalman"), bandwidth_hz=25.0, **timing):
     """Joint filter of struts with observers of some kinds."""
     starts, each = starts_of(model, **timing), [observer(kind, bandwidth_hz) for kind in kinds]
-    own = [(i, it) for i, it in enumerate(each) if isinstance(it, KalmanObserver)]
-    heights = {i: it.height_std_m for i, it in enumerate(each) if it.height_std_m is not None}
-    observed = [it.observed(i, starts[i]) for i, it in own]
-    return JointModel(model, starts, observed, heights)
+    followed = [
+        FollowedStrut(i, it.height_std_m, getattr(it, "filter", None), 1e4)
+        for i, it in enumerate(each)
+        if it.height_std_m is not None
+    ]
+    return JointModel(model, starts, followed)
 
 
 def test_mobilities_are_those_of_the_masses(car):
@@ -145,8 +146,8 @@ def test_stated_deviations_are_those_of_the_errors(car, kinds):
         truth = transition @ truth + root @ rng.standard_normal(model.size) + push / model.units
         t_ns = tick * MS
         seen = [None, None]
-        for strut, std in model.heights_std_m.items():
-            row = model.lines[REFERENCE_HEIGHT, strut].row
+        for strut in model.followed:
+            row, std, _ = model.lines[REFERENCE_HEIGHT, strut]
             seen[strut] = Innovation(
                 float(row @ (model.units * truth)) + std * rng.standard_normal(), t_ns
             )

@@ -10,11 +10,12 @@ import yaml
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
-from dart_model.spec import MODELS, parse_model
+from dart_model.spec import MODELS, dump_model, parse_model
 from rig.cli.main import main
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import OperatingPoint, least_damping
 from rig.closed_loop.strut_response import linearise_at
+from rig.formats.run_arrays import open_run
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.plan.config import CONFIGS
@@ -22,9 +23,11 @@ from rig.plan.load import load_plan, plan_of_run
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.trajectory import simulate
 from rig.tuning.expectation import FollowedStretch, expectation_from_noise, part_by_late_force
 from rig.tuning.gains import LEAST_IN_MOTION, Aim, TuningProblem, tune_observer
 from rig.tuning.tune import StatedExpectation, tune, write_config
+from tests.bridge.test_larger_systems import wrong
 
 STEP_M = 15e-6
 NOISE_M = 20e-6
@@ -314,3 +317,35 @@ def test_an_observer_that_states_no_deviation_does_not_suit_such_a_limit(late, m
     assert rig(monkeypatch, *asked, "--out", late / "other.yaml") == 2
     assert "expected --observer kalman, or no such row" in capsys.readouterr().err
     assert not (late / "other.yaml").exists()
+
+
+@pytest.mark.slow
+def test_a_suspension_above_a_tyre_with_a_known_law_is_tuned(tmp_path):
+    """What is expected of it is what a run with it then errs by; the tyre stays as it is."""
+    text = (CONFIGS / "quarter_car_road.yaml").read_text()
+    (tyre,) = [line for line in text.splitlines() if line.startswith("  tyre: {kind")]
+    known = "  tyre: {kind: none, noise_std_m: 5.0e-6}"
+    (tmp_path / "rig.yaml").write_text(text.replace(tyre, known))
+    bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
+    model = tmp_path / "weak.yaml"
+    spec = load_plan(tmp_path / "rig.yaml").model
+    model.write_text(dump_model(wrong(spec, 0.7, ["suspension"]).spec))
+    ready = load_plan(tmp_path / "rig.yaml", duration_s=8.0, model=str(model))
+    with_bench(ready, bench, tmp_path / "run", lockstep=True)
+    [found] = tune(ready, tmp_path / "run", "kalman", Aim(), lambda _what, _share: None)
+    assert found.name == "suspension"
+    write_config(ready, [found], tmp_path / "tuned.yaml", str(model))
+    better = load_plan(tmp_path / "tuned.yaml", duration_s=8.0)
+    assert better.config.observers["tyre"] == ready.config.observers["tyre"]
+    with_bench(better, bench, tmp_path / "again", lockstep=True)
+    truth = simulate(bench, 8_000_000_000, 1_000_000)
+    column = [strut.name for strut in bench.struts].index("suspension")
+    errors = {}
+    for name in ("run", "again"):
+        run = open_run(tmp_path / name)
+        counts = run.t_s > 1.0
+        true_n = np.interp(run.t_s, truth.t_ns * 1e-9, truth.strut_force_n[:, column])
+        missed_n = (run["suspension.force_n"] - true_n)[counts]
+        errors[name] = float(np.sqrt(np.mean(missed_n**2)))
+    assert errors["again"] < 0.5 * errors["run"]
+    assert errors["again"] == pytest.approx(found.tuned.expected.force_n, rel=0.35)

@@ -119,7 +119,7 @@ def finding_plot(
     sought = before - after if corrected else before
     column, mean = max(
         ((i, _mean_over(joined.values[there, i], sought)) for i in (0, 1)),
-        key=lambda item: -float(np.mean((before - item[1]) ** 2)),
+        key=lambda item: -float(np.mean(np.square(before - item[1]))),
     )
     against: Array = joined.values[there, column]
     kept = cloud(against, np.column_stack([before, after]), points // 2)
