@@ -117,10 +117,9 @@ def finding_plot(
         return None
     before, after = joined.values[there, 2], joined.values[there, 3]
     sought = before - after if corrected else before
-    column, mean = max(
-        ((i, _mean_over(joined.values[there, i], sought)) for i in (0, 1)),
-        key=lambda item: -float(np.mean(np.square(before - item[1]))),
-    )
+    means = [_mean_over(joined.values[there, i], sought) for i in (0, 1)]
+    column = min((0, 1), key=lambda i: float(np.mean(np.square(before - means[i]))))
+    mean = means[column]
     against: Array = joined.values[there, column]
     kept = cloud(against, np.column_stack([before, after]), points // 2)
     kept = kept[np.argsort(against[kept], kind="stable")]
