@@ -118,7 +118,12 @@ def finding_plot(
     before, after = joined.values[there, 2], joined.values[there, 3]
     sought = before - after if corrected else before
     means = [_mean_over(joined.values[there, i], sought) for i in (0, 1)]
-    column = min((0, 1), key=lambda i: float(np.mean(np.square(before - means[i]))))
+
+    def left_n2(i: int) -> float:
+        rest: Array = before - means[i]
+        return float(rest @ rest)
+
+    column = min((0, 1), key=left_n2)
     mean = means[column]
     against: Array = joined.values[there, column]
     kept = cloud(against, np.column_stack([before, after]), points // 2)
