@@ -287,7 +287,7 @@ class JointFilter:
         seen: Array = covariance @ line
         variance = float(line @ seen) + 1.0
         mean = mean + model.units * seen * (new / variance)
-        covariance = covariance - np.outer(seen, seen / variance)
+        covariance = covariance - seen[:, None] * (seen / variance)
         return Point(item.t_ns, mean, covariance), new, variance
 
     def _conclude(self, state: JointState, t_ns: int) -> JointState:
@@ -297,13 +297,15 @@ class JointFilter:
         mean = model.mean_at(point.mean, point.t_ns, until_ns, state.inputs, state.motion)
         residuals_n = model.laws_n(mean, state.motion) + model.residuals @ mean
         limits_n = self._limits_n
-        virtual_n = np.clip(self._required @ mean, -limits_n, limits_n)
+        virtual_n = np.minimum(np.maximum(self._required @ mean, -limits_n), limits_n)
         number = model.grid_index(t_ns) - model.grid_index(point.t_ns)
         covariance = model.force_covariance(model.ahead(point.covariance, number))
         is_disturbed = np.diagonal(covariance) > STEADY_VARIANCE * model.usual_n2
         is_disturbed[self._struts] |= np.abs(virtual_n) >= limits_n
         scales = np.array([reference.scale for reference in state.references])
-        covariance = covariance * np.sqrt(np.outer(scales, scales))
+        roots = np.sqrt(scales)
+        covariance *= roots[:, None]
+        covariance *= roots
         own = model.own
         covariance[own, own] += model.lag.variances_n2(state.lag, scales[own])
         stds_n = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))

@@ -39,8 +39,10 @@ from rig.observers.protocol import Innovation, Start
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS, VirtualSensorConfig
 from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.replay import replay
 from tests.bridge.cores import FIRST, GAINS, core, measured, resting, run
+from tests.bridge.test_moving_base import driven_by_force, on_a_road
 from tests.dart_model.mechanisms import double_wishbone
 from tests.run.listed import MS, ListPort, bench_frames, live
 
@@ -326,6 +328,38 @@ def test_a_second_observer_costs_no_more_than_the_first(capsys):
     two = np.median(found["quarter car, observed"] - alone)
     # The difference of two times is noisy; the quarter car's own time bounds what it may be.
     assert two <= 2.0 * max(one, 0.0) + 0.25 * np.median(alone)
+
+
+def steps_of_plan(plan: Plan) -> Subject:
+    """Steps of a plan whose every channel has a sample at each tick, after the start."""
+    middles = {strut.name: strut.free_length_m - 0.05 for strut in plan.model.struts}
+
+    def step_input(tick: int) -> StepInput:
+        swing = 1e-3 * math.sin(0.05 * tick)
+        samples = (
+            Sample(channel.index, middles.get(channel.name, 0.0) + swing, tick * MS)
+            for channel in plan.channels
+        )
+        return StepInput(tick * MS, tuple(samples))
+
+    rig = build_bridge(plan).supervisor
+    state = rig.init(0)
+    for tick in range(1000):
+        state, output, _ = rig.step(state, step_input(tick))
+    assert output.mode is Mode.RUNNING
+    return steps(rig, state, [step_input(tick) for tick in range(1000, 1000 + TICKS)])
+
+
+def test_a_car_on_a_road_costs_little_more_than_one_driven_by_a_force(tmp_path, capsys):
+    found = compare_rounds(
+        {
+            "driven by a force": steps_of_plan(driven_by_force(tmp_path)[0]),
+            "on a road": steps_of_plan(on_a_road()[0]),
+        },
+        capsys,
+    )
+    ratio = np.median(found["on a road"] / found["driven by a force"])
+    assert ratio <= 1.2
 
 
 def steps_of(plant: DartPlant, height_m: float) -> Subject:

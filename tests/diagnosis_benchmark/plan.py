@@ -58,7 +58,8 @@ GROUPS = {
     ),
     "dyno_pair": Group(10, ("dyno_pair",), "two effects on a dyno, half rough"),
     "dyno_complete": Group(20, ("dyno_complete",), "nothing planted on a dyno, half rough"),
-    "moving": Group(60, moving.KINDS, "one to three effects, base moved, rough nominal model"),
+    "moving": Group(45, moving.KINDS[:2], "one to three effects, base moved, rough nominal model"),
+    "posts": Group(15, moving.KINDS[2:], "the same in a car on four posts"),
     "faint": Group(0, FAMILIES, "one effect below five times the floor"),
 }
 
