@@ -343,16 +343,12 @@ class DartPlant:
 
     def mechanics(self, q: Array, v: Array) -> Mechanics:
         """Equations of motion at coordinates `q` with rates `v`, each of shape (n,)."""
-        here, dart, inputs = self._geometry.at(q), self._skeleton.dart, self._skeleton.inputs
-        dart.setPositions(q)
-        dart.setVelocities(v)
-        dart.setForces(np.zeros(self.coordinates))
-        dart.setCommands(np.zeros(self.coordinates))
-        dart.computeForwardDynamics()
-        every = np.array(dart.getMassMatrix(), dtype=np.float64)
-        free, moved = inputs.free, inputs.moved
-        mass = every[np.ix_(free, free)]
-        bias = mass @ np.array(dart.getAccelerations(), dtype=np.float64)[free]
+        here, free, moved = (
+            self._geometry.at(q),
+            self._skeleton.inputs.free,
+            self._skeleton.inputs.moved,
+        )
+        every, mass, bias = self._tree_at(q, v)
         columns, by_motion = here.inputs[free], np.zeros((self.struts, 0))
         if moved is not None:
             columns = columns - every[free][:, moved.coordinates] @ here.inputs[moved.coordinates]
@@ -361,6 +357,18 @@ class DartPlant:
         mechanics = Mechanics(here.heights_m(q), struts, columns, by_motion, mass, bias)
         loops = self._skeleton.loops
         return mechanics if loops is None else self._with_loops(mechanics, loops, q, here)
+
+    def _tree_at(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Mass matrices of all and of the free coordinates, and bias force on these, of the tree."""
+        dart, free = self._skeleton.dart, self._skeleton.inputs.free
+        dart.setPositions(q)
+        dart.setVelocities(v)
+        dart.setForces(np.zeros(self.coordinates))
+        dart.setCommands(np.zeros(self.coordinates))
+        dart.computeForwardDynamics()
+        every = np.array(dart.getMassMatrix(), dtype=np.float64)
+        mass = every[np.ix_(free, free)]
+        return every, mass, mass @ np.array(dart.getAccelerations(), dtype=np.float64)[free]
 
     def _with_loops(self, tree: Mechanics, loops: Loops, q: Array, here: Jacobians) -> Mechanics:
         """The equations of motion on the free coordinates, from those of the tree.
@@ -411,6 +419,8 @@ class DartPlant:
 
     def _bias_at(self, q: Array, v: Array) -> Array:
         """Bias force with the free and moved coordinates and rates of `q` and `v`."""
+        if self._skeleton.loops is None:
+            return self._tree_at(q, v)[2]
         q = self._closed(q)
         return self.mechanics(q, self._spread(q) @ v).bias
 

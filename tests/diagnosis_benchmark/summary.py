@@ -48,13 +48,14 @@ dyno, of the standard deviation of the strut force) is missing.
 `single`, `pair` and `triple` are groups with one, two and three planted effects; `complete` has
 none. In `foreign`, the planted force belongs to a family of `rig`, but has a formula that `rig`
 does not contain; in `outside`, no law of `rig` describes the planted force. `rough` stands for a
-rough nominal model, `dyno` for a dyno; the groups that are called just `rough` and `dyno` have
-one planted effect. In `moving` and `posts` the base is moved as measured: a mass on a shaker, a
-quarter car, or a full car on four posts, with one to three effects in a suspension; every height
-and every position of the base has white noise of 10 µm (on posts 5 µm), and springs, dampers and
-wheels of the model are rough. On dynos, about half of the cases have a rough nominal model, unless the planted
-effect is linear. With a rough nominal model and no planted effect, `explained` is right, because
-linear corrections explain the data. The rows in italics combine groups, as far as these were run.
+rough nominal model, `dyno` for a dyno; the groups that are called just `rough` and `dyno` have one
+planted effect. In `moving` and `posts` the base is moved as measured: a mass on a shaker, a quarter
+car, or a full car on four posts, with one to three effects in a suspension; every height and every
+position of the base has white noise of 10 µm (on posts 5 µm), and springs, dampers and wheels of
+the model are rough. On dynos, about half of the cases have a rough nominal model, unless the
+planted effect is linear. With a rough nominal model and no planted effect, `explained` is right,
+because linear corrections explain the data. The rows in italics combine groups, as far as these
+were run.
 
 {{groups}} With `--one-of N` in the command at the end of the page,
 about one case of N was run in each group, and at least one.

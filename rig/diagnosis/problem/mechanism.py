@@ -261,6 +261,12 @@ def solve_nearest(rows: Array, values: Array) -> Array:
     measured heights are the nearest ones, and forces in the struts those without a part that is in
     balance with itself.
     """
-    if rows.shape[-1] == rows.shape[-2]:
-        return np.asarray(np.linalg.solve(rows, values[..., np.newaxis])[..., 0], np.float64)
-    return np.asarray((np.linalg.pinv(rows) @ values[..., np.newaxis])[..., 0], np.float64)
+    equations, unknowns = rows.shape[-2:]
+    columns, turned = values[..., np.newaxis], np.swapaxes(rows, -1, -2)
+    if equations == unknowns:
+        found = np.linalg.solve(rows, columns)
+    elif equations > unknowns:
+        found = np.linalg.solve(turned @ rows, turned @ columns)
+    else:
+        found = turned @ np.linalg.solve(rows @ turned, columns)
+    return np.asarray(found[..., 0], np.float64)
