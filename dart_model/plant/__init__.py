@@ -343,11 +343,8 @@ class DartPlant:
 
     def mechanics(self, q: Array, v: Array) -> Mechanics:
         """Equations of motion at coordinates `q` with rates `v`, each of shape (n,)."""
-        here, free, moved = (
-            self._geometry.at(q),
-            self._skeleton.inputs.free,
-            self._skeleton.inputs.moved,
-        )
+        here, inputs = self._geometry.at(q), self._skeleton.inputs
+        free, moved = inputs.free, inputs.moved
         every, mass, bias = self._tree_at(q, v)
         columns, by_motion = here.inputs[free], np.zeros((self.struts, 0))
         if moved is not None:
