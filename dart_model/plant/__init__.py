@@ -356,7 +356,7 @@ class DartPlant:
         return mechanics if loops is None else self._with_loops(mechanics, loops, q, here)
 
     def _tree_at(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Mass matrices of all and of the free coordinates, and bias force on these, of the tree."""
+        """Mass matrices of all and of the free coordinates, and the bias force on these."""
         dart, free = self._skeleton.dart, self._skeleton.inputs.free
         dart.setPositions(q)
         dart.setVelocities(v)
