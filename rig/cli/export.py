@@ -28,6 +28,16 @@ EXAMPLES = (
 )
 
 
+_Added = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--add",
+        metavar="SENSOR",
+        help=f"With --bench: virtual sensor that is an output of the FMU: {ADDED_HELP}",
+    ),
+]
+
+
 def export_command(
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="Folder of a run; with --fmu a model file.")
@@ -66,14 +76,7 @@ def export_command(
             help="With --fmu: export the whole bench; it must have one guided degree of freedom.",
         ),
     ] = False,
-    add: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--add",
-            metavar="SENSOR",
-            help=f"With --bench: virtual sensor that is an output of the FMU: {ADDED_HELP}",
-        ),
-    ] = None,
+    add: _Added = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Export a run or a model to other programs.

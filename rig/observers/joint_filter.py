@@ -44,7 +44,7 @@ from rig.observers.error_filter import (
     update_scale,
 )
 from rig.observers.joint_lag import JointLag
-from rig.observers.joint_model import Inputs, JointModel, Motion
+from rig.observers.joint_model import ErrorMotion, Inputs, JointModel
 from rig.observers.protocol import REFERENCE_HEIGHT, Innovation
 from rig.observers.sensor_health import GATE, SILENT, SensorHealth
 
@@ -114,7 +114,7 @@ class JointState(Struct, frozen=True, gc=False):
 
     filter: "JointFilter"
     point: Point
-    motion: Motion
+    motion: ErrorMotion
     inputs: Inputs
     used: tuple[Used, ...]
     references: tuple[Reference, ...]
@@ -139,7 +139,6 @@ class JointFilter:
             strut: scale_fading(model.starts[strut].interval_ns) for strut in model.followed
         }
         self._struts = struts = list(model.followed)
-        self._places = {strut: place for place, strut in enumerate(struts)}
         self._limits_n = np.array([item.force_limit_n for item in model.followed.values()])
         corner = min(model.fastest, MOST_PER_INTERVAL * 1e9 / model.interval_ns)
         wanted = corner**2 * model.heights[struts] + 2.0 * DAMPING * corner * model.rates[struts]
@@ -309,35 +308,26 @@ class JointFilter:
         own = model.own
         covariance[own, own] += model.lag.variances_n2(state.lag, scales[own])
         stds_n = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        virtuals_n = np.zeros(len(residuals_n))
+        virtuals_n[self._struts] = virtual_n
         left_out = self._left_out(state.health, t_ns)
-        every = zip(residuals_n.tolist(), stds_n.tolist(), is_disturbed.tolist(), strict=True)
-        forces_n: list[float] = virtual_n.tolist()
+        columns = (virtuals_n, residuals_n, stds_n, is_disturbed)
+        every = zip(state.references, *(column.tolist() for column in columns), strict=True)
         struts = tuple(
-            self._strut(strut, state.references[strut], t_ns, forces_n, left_out, *of_strut)
-            for strut, of_strut in enumerate(every)
+            JointStrut(
+                reference.innovation_m if strut in self._fadings else math.nan,
+                force_n,
+                residual_n,
+                std_n,
+                # Where no height is used, none is awaited.
+                reference.measured_ns if strut in self._fadings else t_ns,
+                tuple(channel for channel in left_out if self._sensors[channel].strut == strut),
+                disturbed,
+            )
+            for strut, (reference, force_n, residual_n, std_n, disturbed) in enumerate(every)
         )
         inputs = self._with_input(state.inputs, point.t_ns, t_ns, virtual_n)
         return replace(state, inputs=inputs, struts=struts, covariance_n2=covariance)
-
-    def _strut(
-        self,
-        strut: int,
-        reference: Reference,
-        t_ns: int,
-        virtual_n: Sequence[float],
-        left_out: Sequence[int],
-        residual_n: float,
-        std_n: float,
-        is_disturbed: bool,
-    ) -> JointStrut:
-        place = self._places.get(strut)
-        force_n = 0.0 if place is None else virtual_n[place]
-        if strut not in self._fadings:
-            # No height of it is awaited.
-            return JointStrut(math.nan, force_n, residual_n, std_n, t_ns, (), is_disturbed)
-        out = tuple(channel for channel in left_out if self._sensors[channel].strut == strut)
-        innovation_m, measured_ns = reference.innovation_m, reference.measured_ns
-        return JointStrut(innovation_m, force_n, residual_n, std_n, measured_ns, out, is_disturbed)
 
     def _with_input(self, inputs: Inputs, known_ns: int, t_ns: int, force_n: Array) -> Inputs:
         if t_ns <= inputs[-1][0]:

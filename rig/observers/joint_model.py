@@ -71,7 +71,7 @@ class FollowedStrut(NamedTuple):
     force_limit_n: float
 
 
-class Motion(NamedTuple):
+class ErrorMotion(NamedTuple):
     """How the error moves where the model is.
 
     Attributes:
@@ -85,7 +85,7 @@ class Motion(NamedTuple):
     per_s: float
 
 
-class Line(NamedTuple):
+class SensorLine(NamedTuple):
     """A sensor: its reading by the state in SI, its deviation, and their ratio in units."""
 
     row: Array
@@ -178,7 +178,7 @@ class JointModel:
         together = self._model.mobility_per_kg[np.ix_(struts, struts)]
         return np.asarray(np.linalg.pinv(together, rcond=1e-9), np.float64)
 
-    def _make_lines(self, errors: Sequence[StrutErrors]) -> dict[tuple[int, int], Line]:
+    def _make_lines(self, errors: Sequence[StrutErrors]) -> dict[tuple[int, int], SensorLine]:
         found = {
             (REFERENCE_HEIGHT, strut): (errors[strut].height, item.noise_std_m)
             for strut, item in self.followed.items()
@@ -187,9 +187,11 @@ class JointModel:
             for channel in start.sensors:
                 row = STRUT_SENSORS[channel.quantity].error(errors[strut])
                 found[channel.index, strut] = row, channel.noise_std
-        return {key: Line(row, std, row * self.units / std) for key, (row, std) in found.items()}
+        return {
+            key: SensorLine(row, std, row * self.units / std) for key, (row, std) in found.items()
+        }
 
-    def motion_with(self, laws: Array) -> Motion:
+    def motion_with(self, laws: Array) -> ErrorMotion:
         """Motion with forces of the struts' laws by coordinates and rates, shape (struts, 2 n)."""
         n, count = self._n, len(self.own)
         motion = self._model.free + self._model.by_force @ laws
@@ -202,9 +204,11 @@ class JointModel:
         forgetting = [_FORGETTING * item.omega for item in self._filters.values()]
         np.fill_diagonal(forces, np.negative(forgetting * STATES))
         stiffness, damping = (np.abs(part).sum(axis=1).max() for part in np.hsplit(motion, 2))
-        return Motion(laws, generator, max(math.sqrt(stiffness), float(damping)))
+        return ErrorMotion(laws, generator, max(math.sqrt(stiffness), float(damping)))
 
-    def with_slopes(self, motion: Motion, slopes: Sequence[tuple[float, float]]) -> Motion:
+    def with_slopes(
+        self, motion: ErrorMotion, slopes: Sequence[tuple[float, float]]
+    ) -> ErrorMotion:
         """Motion with stiffness (N/m) and damping (N·s/m) of each strut's law."""
         stiffness, damping = -np.array(slopes).T[:, :, None]
         heights = self._model.heights
@@ -283,12 +287,12 @@ class JointModel:
         """
         return self._scaled_forces @ covariance @ self._scaled_forces.T
 
-    def laws_n(self, mean: Array, motion: Motion) -> Array:
+    def laws_n(self, mean: Array, motion: ErrorMotion) -> Array:
         """Forces by which the laws err because the model is not where the bench is, (struts,)."""
         return motion.laws @ mean[: 2 * self._n]
 
     def mean_at(
-        self, mean: Array, from_ns: int, to_ns: int, inputs: Inputs, motion: Motion
+        self, mean: Array, from_ns: int, to_ns: int, inputs: Inputs, motion: ErrorMotion
     ) -> Array:
         """The state at a later time, under the inputs in between."""
         last = len(inputs) - 1

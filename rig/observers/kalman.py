@@ -104,6 +104,10 @@ class KalmanObserver:
     def height_std_m(self) -> float:
         return self.filter.noise_std_m
 
+    @property
+    def force_filter(self) -> ErrorFilter:
+        return self.filter
+
     def init(self, start: Start) -> KalmanState:
         return self._initial(self.filter.init(start), start)
 

@@ -58,6 +58,10 @@ class NoObserver:
         return self.noise_std_m
 
     @property
+    def force_filter(self) -> None:
+        return None
+
+    @property
     def force_limit_n(self) -> float:
         """Zero: it has no virtual force."""
         return 0.0

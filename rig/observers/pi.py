@@ -124,6 +124,10 @@ class PiObserver:
         return None
 
     @property
+    def force_filter(self) -> None:
+        return None
+
+    @property
     def measurements_to_start(self) -> int:
         """Enough for height and velocity: a parabola through twelve of them."""
         return 12

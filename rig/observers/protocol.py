@@ -2,13 +2,16 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
 from rig.channels.channel import Channel
+
+if TYPE_CHECKING:
+    from rig.observers.error_filter import ErrorFilter
 
 REFERENCE_HEIGHT = -1
 """Channel of an innovation of the strut's own height, `signals.height`."""
@@ -137,6 +140,11 @@ class Observer(Protocol[StateT]):
     @property
     def height_std_m(self) -> float | None:
         """Standard deviation of the height in a joint filter; None where it corrects none."""
+        ...
+
+    @property
+    def force_filter(self) -> "ErrorFilter | None":
+        """Filter of its residual force in a joint filter; None where that estimates none."""
         ...
 
     @property

@@ -7,7 +7,6 @@ from msgspec import Struct
 from rig.observers.error_model import ErrorModel
 from rig.observers.joint_filter import JointFilter, JointState
 from rig.observers.joint_model import FollowedStrut, JointModel
-from rig.observers.kalman import KalmanObserver
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 
 
@@ -139,19 +138,15 @@ class StrutObservers:
         return self._join(struts, joint)
 
     def _make_joint(self, starts: Sequence[Start], model: ErrorModel) -> JointFilter | None:
-        own = {
-            strut: observer
-            for strut, observer in enumerate(self.each)
-            if isinstance(observer, KalmanObserver)
-        }
+        own = [strut for strut, it in enumerate(self.each) if it.force_filter is not None]
         if not any(model.moves_another(strut) or starts[strut].sensors for strut in own):
             return None
-        largest_n = max(observer.force_limit_n for observer in own.values())
+        largest_n = max(self.each[strut].force_limit_n for strut in own)
         followed = [
             FollowedStrut(
                 strut,
                 observer.height_std_m,
-                own[strut].filter if strut in own else None,
+                observer.force_filter,
                 observer.force_limit_n or largest_n,
             )
             for strut, observer in enumerate(self.each)

@@ -61,7 +61,7 @@ def joint_of(model, kinds=("kalman", "kalman"), bandwidth_hz=25.0, **timing):
     """Joint filter of struts with observers of some kinds."""
     starts, each = starts_of(model, **timing), [observer(kind, bandwidth_hz) for kind in kinds]
     followed = [
-        FollowedStrut(i, it.height_std_m, getattr(it, "filter", None), 1e4)
+        FollowedStrut(i, it.height_std_m, it.force_filter, 1e4)
         for i, it in enumerate(each)
         if it.height_std_m is not None
     ]

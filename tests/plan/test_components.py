@@ -99,7 +99,7 @@ class Proportional:
     measurements_to_start = 1
     requires_height = estimates_force = True
     fuses_sensors = knows_std = is_joinable = False
-    height_std_m = None
+    height_std_m = force_filter = None
     force_limit_n = 1e4
 
     def init(self, start):
