@@ -138,8 +138,9 @@ class JointFilter:
         self._fadings = {
             strut: scale_fading(model.starts[strut].interval_ns) for strut in model.followed
         }
-        self._struts = struts = list(model.followed)
-        self._limits_n = np.array([item.force_limit_n for item in model.followed.values()])
+        self.struts = struts = list(model.followed)
+        """Indices of the struts whose heights are followed."""
+        self._no_limits_n = np.full(len(struts), np.inf)
         corner = min(model.fastest, MOST_PER_INTERVAL * 1e9 / model.interval_ns)
         wanted = corner**2 * model.heights[struts] + 2.0 * DAMPING * corner * model.rates[struts]
         self._required = model.forces_by_accelerations(struts) @ wanted + model.residuals[struts]
@@ -163,7 +164,7 @@ class JointFilter:
             channel: SensorHealth(t_ns, is_out=before.health[channel].is_out)
             for channel in begun.health
         }
-        return self._conclude(replace(begun, lag=lag, health=health), t_ns)
+        return self._conclude(replace(begun, lag=lag, health=health), t_ns, self._no_limits_n)
 
     def _begin(self, t_ns: int, covariance: Array) -> JointState:
         model = self._model
@@ -173,7 +174,7 @@ class JointFilter:
         health = {channel: SensorHealth(t_ns) for channel in self._sensors}
         lag = model.lag.init(t_ns)
         state = JointState(self, point, model.motion, inputs, (), references, health, lag)
-        return self._conclude(state, t_ns)
+        return self._conclude(state, t_ns, self._no_limits_n)
 
     def step(
         self,
@@ -181,8 +182,12 @@ class JointFilter:
         t_ns: int,
         innovations: Sequence[Innovation | None],
         further: Sequence[Sequence[Innovation]],
+        limits_n: Sequence[float],
     ) -> JointState:
-        """State after a tick, with the innovations of new heights and further sensors by strut."""
+        """State after a tick, with the innovations of new heights and further sensors by strut.
+
+        `limits_n` are the largest magnitudes of the followed struts' virtual forces.
+        """
         new = [
             (item, strut)
             for strut, item in enumerate(innovations)
@@ -231,7 +236,7 @@ class JointFilter:
             health=health,
             lag=lag,
         )
-        return self._conclude(moved, t_ns)
+        return self._conclude(moved, t_ns, np.asarray(limits_n))
 
     def _use_height(
         self, state: JointState, before: Point, item: Innovation, strut: int, known: Reference
@@ -289,18 +294,17 @@ class JointFilter:
         covariance = covariance - seen[:, None] * (seen / variance)
         return Point(item.t_ns, mean, covariance), new, variance
 
-    def _conclude(self, state: JointState, t_ns: int) -> JointState:
+    def _conclude(self, state: JointState, t_ns: int, limits_n: Array) -> JointState:
         """State with what it says of each strut at a time, and with the virtual forces from it."""
         model, point = self._model, state.point
         until_ns = min(t_ns, point.t_ns + self._longest_ns)
         mean = model.mean_at(point.mean, point.t_ns, until_ns, state.inputs, state.motion)
         residuals_n = model.laws_n(mean, state.motion) + model.residuals @ mean
-        limits_n = self._limits_n
         virtual_n = np.minimum(np.maximum(self._required @ mean, -limits_n), limits_n)
         number = model.grid_index(t_ns) - model.grid_index(point.t_ns)
         covariance = model.force_covariance(model.ahead(point.covariance, number))
         is_disturbed = np.diagonal(covariance) > STEADY_VARIANCE * model.usual_n2
-        is_disturbed[self._struts] |= np.abs(virtual_n) >= limits_n
+        is_disturbed[self.struts] |= np.abs(virtual_n) >= limits_n
         scales = np.array([reference.scale for reference in state.references])
         roots = np.sqrt(scales)
         covariance *= roots[:, None]
@@ -309,7 +313,7 @@ class JointFilter:
         covariance[own, own] += model.lag.variances_n2(state.lag, scales[own])
         stds_n = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         virtuals_n = np.zeros(len(residuals_n))
-        virtuals_n[self._struts] = virtual_n
+        virtuals_n[self.struts] = virtual_n
         left_out = self._left_out(state.health, t_ns)
         columns = (virtuals_n, residuals_n, stds_n, is_disturbed)
         every = zip(state.references, *(column.tolist() for column in columns), strict=True)
@@ -360,7 +364,7 @@ class JointFilter:
         mean, forces = self._model.of_numbers(numbers)
         since = [since_ns for since_ns, _ in state.inputs]
         struts = list(state.struts)
-        for strut, force_n in zip(self._struts, forces[-1].tolist(), strict=True):
+        for strut, force_n in zip(self.struts, forces[-1].tolist(), strict=True):
             struts[strut] = replace(struts[strut], virtual_force_n=force_n)
         return replace(
             state,

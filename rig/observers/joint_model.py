@@ -62,13 +62,11 @@ class FollowedStrut(NamedTuple):
         strut: Its index.
         noise_std_m: Standard deviation of its height.
         filter: Bandwidth of its residual force; None where its law is known.
-        force_limit_n: Largest magnitude of its virtual force.
     """
 
     strut: int
     noise_std_m: float
     filter: ErrorFilter | None
-    force_limit_n: float
 
 
 class ErrorMotion(NamedTuple):

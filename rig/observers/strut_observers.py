@@ -31,6 +31,9 @@ class StrutObservers:
 
     def __init__(self, observers: Sequence[AnyObserver]) -> None:
         self.each = tuple(observers)
+        # A strut that has a known law has no limit of its own.
+        largest_n = max((it.force_limit_n for it in self.each), default=0.0)
+        self._limits_n = [it.force_limit_n or largest_n for it in self.each]
 
     def init(
         self, starts: Sequence[Start], model: ErrorModel, before: ObserversState
@@ -82,7 +85,9 @@ class StrutObservers:
                     ]
                 )
             )
-        joint = state.joint.filter.step(state.joint, t_ns, innovations, further)
+        follower = state.joint.filter
+        limits_n = [self._limits_n[strut] for strut in follower.struts]
+        joint = follower.step(state.joint, t_ns, innovations, further, limits_n)
         struts = tuple(
             before if _is_joint(observer, joint) else observer.step(before, t_ns, innovation)
             for observer, before, innovation in zip(
@@ -141,13 +146,11 @@ class StrutObservers:
         own = [strut for strut, it in enumerate(self.each) if it.force_filter is not None]
         if not any(model.moves_another(strut) or starts[strut].sensors for strut in own):
             return None
-        largest_n = max(self.each[strut].force_limit_n for strut in own)
         followed = [
             FollowedStrut(
                 strut,
                 observer.height_std_m,
                 observer.force_filter,
-                observer.force_limit_n or largest_n,
             )
             for strut, observer in enumerate(self.each)
             if observer.height_std_m is not None

@@ -1,5 +1,6 @@
 """The joint filter: against the filter of one strut, against theory, and in closed loop."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -61,7 +62,7 @@ def joint_of(model, kinds=("kalman", "kalman"), bandwidth_hz=25.0, **timing):
     """Joint filter of struts with observers of some kinds."""
     starts, each = starts_of(model, **timing), [observer(kind, bandwidth_hz) for kind in kinds]
     followed = [
-        FollowedStrut(i, it.height_std_m, it.force_filter, 1e4)
+        FollowedStrut(i, it.height_std_m, it.force_filter)
         for i, it in enumerate(each)
         if it.height_std_m is not None
     ]
@@ -102,7 +103,7 @@ def test_of_one_strut_it_is_the_filter_of_one_strut(bandwidth_hz, delay, monkeyp
         t_ns = tick * MS
         seen = None if tick % 37 == 0 else Innovation(heights[tick], t_ns - delay_ns)
         alone = one.step(alone, t_ns, seen)
-        state = joint.step(state, t_ns, [seen], [[]])
+        state = joint.step(state, t_ns, [seen], [[]], [1e4] * len(joint.struts))
         (found,) = state.struts
         # A thousandth: the one filter has constant gains where the other's come ever closer.
         assert found.virtual_force_n == pytest.approx(alone.virtual_force_n, rel=1e-3, abs=1e-2)
@@ -151,7 +152,7 @@ def test_stated_deviations_are_those_of_the_errors(car, kinds):
             seen[strut] = Innovation(
                 float(row @ (model.units * truth)) + std * rng.standard_normal(), t_ns
             )
-        state = joint.step(state, t_ns, seen, [[], []])
+        state = joint.step(state, t_ns, seen, [[], []], [1e4] * len(joint.struts))
         if tick > 2000:
             real = model._scaled_forces @ truth
             found = [it.residual_force_n for it in state.struts]
@@ -173,7 +174,9 @@ def test_a_constant_force_is_found_in_each_strut(car):
         truth = model.mean_at(truth, 0, MS, state.inputs[-1:], motion)
         t_ns = tick * MS
         heights = [model.lines[REFERENCE_HEIGHT, strut].row @ truth for strut in (0, 1)]
-        state = joint.step(state, t_ns, [Innovation(h, t_ns) for h in heights], [[], []])
+        state = joint.step(
+            state, t_ns, [Innovation(h, t_ns) for h in heights], [[], []], [1e4] * len(joint.struts)
+        )
     assert [it.virtual_force_n for it in state.struts] == pytest.approx([30.0, -50.0], rel=1e-5)
     assert np.abs(heights).max() < 1e-8
 
@@ -201,7 +204,7 @@ def test_forces_in_balance_with_one_another_have_bounded_variances():
     state = joint.steady_state(0)
     for tick in range(1, 500):
         seen = [Innovation(1e-5, tick * MS)] * 2
-        state = joint.step(state, tick * MS, seen, [[], []])
+        state = joint.step(state, tick * MS, seen, [[], []], [1e4] * len(joint.struts))
     assert all(math.isfinite(it.virtual_force_n) for it in state.struts)
     together = state.covariance_n2.sum()
     assert together < 1e-3 * np.diagonal(state.covariance_n2).sum()
@@ -236,6 +239,29 @@ def test_a_further_sensor_narrows_the_force_of_its_strut(car, quantity, noise_st
     state, without = joint.steady_state(0), plain.steady_state(0)
     for tick in range(1, 300):
         seen = [Innovation(0.0, tick * MS)] * 2
-        state = joint.step(state, tick * MS, seen, [[], [Innovation(0.0, tick * MS, 4)]])
-        without = plain.step(without, tick * MS, seen, [[], []])
+        state = joint.step(
+            state, tick * MS, seen, [[], [Innovation(0.0, tick * MS, 4)]], [1e4] * len(joint.struts)
+        )
+        without = plain.step(without, tick * MS, seen, [[], []], [1e4] * len(plain.struts))
     assert state.struts[1].force_std_n < share * without.struts[1].force_std_n
+
+
+def test_another_force_limit_holds_from_the_next_tick_on(car):
+    """A state of observers that differ in their limits alone goes on."""
+    wide, narrow = (
+        StrutObservers([replace_limit(observer(), limit_n), observer("measured")])
+        for limit_n in (1e4, 3.0)
+    )
+    state = wide.init(starts_of(car), car, ObserversState())
+    for tick in range(1, 30):
+        seen = [Innovation(1e-4, tick * MS), Innovation(0.0, tick * MS)]
+        state = wide.step(state, tick * MS, seen, [[], []])
+    assert abs(state.struts[0].virtual_force_n) > 3.0
+    seen = [Innovation(1e-4, 30 * MS), Innovation(0.0, 30 * MS)]
+    state = narrow.step(state, 30 * MS, seen, [[], []])
+    assert max(abs(it.virtual_force_n) for it in state.struts) <= 3.0
+    assert state.struts[0].is_disturbed
+
+
+def replace_limit(made, limit_n):
+    return dataclasses.replace(made, force_limit_n=limit_n)
