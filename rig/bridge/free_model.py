@@ -290,7 +290,7 @@ class FreeModelEstimator:
         model = self._plant.init(heights, velocities, t_ns * 1e-9, inputs)
         no_forces = (0.0,) * len(first)
         loaded = self._plant.load(model, no_forces, inputs, state.temperature_c)
-        moves = linearise(self._plant, model, inputs)
+        moves = linearise(self._plant, model, self._at_rest(inputs))
         starts = [
             self._start_of_strut(strut, first[strut], t_ns, response)
             for strut, response in enumerate(moves.responses())
@@ -306,12 +306,19 @@ class FreeModelEstimator:
             longest_gaps_ns=longest_gaps_ns,
             bands=state.bands or (InnovationBand(),) * len(first),
             input_noises=tuple(
-                self._input_noise(model, inputs, column, gains)
+                self._input_noise(model, self._at_rest(inputs), column, gains)
                 for _, column, gains in self._motions
             ),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, no_forces, self._newest_ns(state))
+
+    def _at_rest(self, inputs: Sequence[float]) -> tuple[float, ...]:
+        """Inputs whose motions stand still where they are."""
+        still = list(inputs)
+        for _, column, _ in self._motions:
+            still[column + 1 : column + 3] = 0.0, 0.0
+        return tuple(still)
 
     def _input_noise(
         self, model: ModelState, inputs: Sequence[float], column: int, gains: NoiseGains
@@ -322,10 +329,11 @@ class FreeModelEstimator:
 
     def force_covariance_n2(self, state: FreeModelState) -> Array:
         joint = state.observers.joint
-        if joint is None or joint.covariance_n2 is None:
-            known = np.diag([strut.force_std_n**2 for strut in state.observers.struts])
-        else:
-            known = joint.covariance_n2
+        stds_n = np.array([strut.force_std_n for strut in state.observers.struts])
+        known = np.diag(stds_n**2) if joint is None else joint.covariance_n2.copy()
+        # The joint filter does not know what an observer of another kind adds.
+        unknown = np.isnan(stds_n)
+        known[unknown] = known[:, unknown] = np.nan
         for (index, _, _), noise in zip(self._motions, state.input_noises, strict=True):
             known = known + self._inputs[index].square_m2(state.inputs[index]) * noise
         return known

@@ -3,7 +3,7 @@
 The bridge marks its estimate invalid by it and then enters the safe state
 (`rig.bridge.mode_supervisor`), and starts no model from measurements that are too old. The two ages
 are `supervision.stale_after_s` and `supervision.safe_after_s` of a configuration. A further sensor
-of a strut is left out by its own interval (`rig.observers.sensor_fusion`).
+of a strut is left out by its own interval (`rig.observers.joint_filter`).
 """
 
 _MOST_CYCLES = 3

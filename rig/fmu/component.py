@@ -205,7 +205,7 @@ class _Build:
     ) -> None:
         """Add a variable."""
         if name in self._variables:
-            raise InputError(f"{name}: two variables of this name, expected struts of other names")
+            raise InputError(f"{name}: two variables of this name, expected other names")
         self._variables[name] = Variable(name, unit, kind, meaning, start, nominal, is_output)
 
     def strut(

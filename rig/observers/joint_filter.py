@@ -120,8 +120,8 @@ class JointState(Struct, frozen=True, gc=False):
     references: tuple[Reference, ...]
     health: dict[int, SensorHealth]
     lag: JointLag
-    struts: tuple[JointStrut, ...] = ()
-    covariance_n2: Array | None = None
+    struts: tuple[JointStrut, ...]
+    covariance_n2: Array
 
 
 class JointFilter:
@@ -141,8 +141,9 @@ class JointFilter:
         self.struts = struts = list(model.followed)
         """Indices of the struts whose heights are followed."""
         self._no_limits_n = np.full(len(struts), np.inf)
-        corner = min(model.fastest, MOST_PER_INTERVAL * 1e9 / model.interval_ns)
-        wanted = corner**2 * model.heights[struts] + 2.0 * DAMPING * corner * model.rates[struts]
+        intervals_ns = np.array([model.starts[strut].interval_ns for strut in struts])
+        corners = np.minimum(model.fastest, MOST_PER_INTERVAL * 1e9 / intervals_ns)[:, None]
+        wanted = corners**2 * model.heights[struts] + 2.0 * DAMPING * corners * model.rates[struts]
         self._required = model.forces_by_accelerations(struts) @ wanted + model.residuals[struts]
 
     def init(self, t_ns: int) -> JointState:
@@ -172,8 +173,10 @@ class JointFilter:
         inputs = ((t_ns, np.zeros(len(model.followed))),)
         references = tuple(Reference(start.t_ns, start.t_ns) for start in model.starts)
         health = {channel: SensorHealth(t_ns) for channel in self._sensors}
-        lag = model.lag.init(t_ns)
-        state = JointState(self, point, model.motion, inputs, (), references, health, lag)
+        lag, no_forces_n2 = model.lag.init(t_ns), np.zeros((0, 0))
+        state = JointState(
+            self, point, model.motion, inputs, (), references, health, lag, (), no_forces_n2
+        )
         return self._conclude(state, t_ns, self._no_limits_n)
 
     def step(
@@ -220,8 +223,8 @@ class JointFilter:
                 used.append(entry._replace(before=after))
                 after, _, _ = self._update(state, after, entry.reading, entry.strut)
             point = after
-        lag, heights_ns = state.lag, [references[strut].t_ns for strut in self._fadings]
-        if (newest_ns := max(heights_ns)) > lag.t_ns:
+        lag, newest_ns = state.lag, max(references[strut].t_ns for strut in self._model.own)
+        if 2 * (newest_ns - lag.t_ns) >= self._model.interval_ns:
             new_m = np.array([references[strut].new_m for strut in self._fadings])
             lag = self._model.lag.update(lag, newest_ns, new_m)
         oldest_ns = t_ns - self._oldest_ns

@@ -19,12 +19,10 @@ from scipy.linalg import (  # pyright: ignore[reportUnknownVariableType, reportM
     solve_discrete_lyapunov,
 )
 
+from rig.observers.error_filter import MOST_HELD
 from rig.observers.filter_lag import FADING, LARGEST_OF_NOISE, derivatives_filter
 
 Array = NDArray[np.float64]
-
-_MOST_HELD = 20
-"""Missing measurements for which an innovation stands in the derivatives that show a lag."""
 
 
 class JointLag(NamedTuple):
@@ -54,7 +52,7 @@ class JointLagFilter:
         gains: Gains in SI of the errors of the observed heights and of their rates, less what the
             model itself changes in an interval, and a one for each one's own height; each by all
             innovations, shape (3, p, m).
-        decoupling: Forces by accelerations of the observed heights, shape (p, p).
+        by_accelerations: Forces by accelerations of the observed heights, shape (p, p).
         innovations_m2: Steady covariance of the innovations, shape (m, m).
     """
 
@@ -63,14 +61,14 @@ class JointLagFilter:
         omegas: Sequence[float],
         interval_s: float,
         gains: tuple[Array, Array, Array],
-        decoupling: Array,
+        by_accelerations: Array,
         innovations_m2: Array,
     ) -> None:
         self._interval_ns = round(interval_s * 1e9)
         of_error, of_rate, own = gains
         # Of filtered innovations, rates and curvatures: what they show of each force.
         show = np.stack([of_rate / interval_s, of_error / interval_s, own], axis=2)
-        force = np.einsum("pk,kmi->pmi", decoupling, show)
+        force = np.einsum("pk,kmi->pmi", by_accelerations, show)
         transitions: list[Array] = []
         shares: list[Array] = []
         white: list[float] = []
@@ -99,7 +97,7 @@ class JointLagFilter:
         number = max(1, round((t_ns - lag.t_ns) / self._interval_ns))
         filtered, square, peak = lag.filtered, lag.square_n2, lag.peak_n2
         put = self._shares[:, None, :] * innovations_m[None, :, None]
-        for _ in range(min(number, _MOST_HELD)):
+        for _ in range(min(number, MOST_HELD)):
             filtered = filtered @ self._transitions.transpose(0, 2, 1) + put
             new = np.square((self._force * filtered).sum(axis=(1, 2)))
             peak = np.maximum(new, peak - self._fading * peak)

@@ -38,7 +38,7 @@ STATES = 3
 
 _GRID = 16
 """Parts of the time between two heights to which the variances' times are rounded: at most a
-thirtieth of what is unknown is added too early or too late, and never twice."""
+thirtieth of what becomes unknown in that time is added too early or too late."""
 
 _MOST_TRANSITIONS = 256
 """Times on that grid whose transitions are kept: those of all readings but ones behind a gap."""
@@ -104,7 +104,7 @@ class JointModel:
         own: Indices of the observed struts: those whose residual forces are estimated.
         size: Length N of the state.
         forces: Where the residual forces are in the state.
-        interval_ns: Time between two heights of the strut that is measured least often.
+        interval_ns: Time between two heights of the observed strut that is measured least often.
         delay_ns: Largest delay of these heights.
         fastest: Corner of the fastest residual force in rad/s.
         units: Of the state, so that all variances are of one size.
@@ -133,9 +133,8 @@ class JointModel:
         count = len(self.own)
         self.size = 2 * n + STATES * count
         self.forces = slice(2 * n, 2 * n + count)
-        used = [self.starts[strut] for strut in self.followed]
-        self.interval_ns = max(start.interval_ns for start in used)
-        self.delay_ns = max(start.delay_ns for start in used)
+        self.interval_ns = max(self.starts[strut].interval_ns for strut in self.own)
+        self.delay_ns = max(self.starts[strut].delay_ns for strut in self.followed)
         self.fastest = max(item.omega for item in self._filters.values())
         self._unit_m = min(item.noise_std_m for item in followed)
         self._unit_s = 1.0 / self.fastest
@@ -230,7 +229,7 @@ class JointModel:
         transition, noise = self._transition(_GRID)
         struts = list(self.followed)
         rows = np.array([self.lines[REFERENCE_HEIGHT, strut].scaled for strut in struts])
-        often = np.array([self.interval_ns / self.starts[strut].interval_ns for strut in struts])
+        often = self._often()
         ahead = limit_ahead(transition, noise, rows.T @ (often[:, None] * rows))
         seen = ahead @ rows.T
         innovations = rows @ seen + np.diag(1.0 / often)
@@ -238,9 +237,17 @@ class JointModel:
         after: Array = ahead - gains @ seen.T
         return 0.5 * (after + after.T), gains, innovations
 
+    def _often(self) -> Array:
+        """How many heights of each followed strut come in an interval."""
+        return np.array([self.interval_ns / self.starts[it].interval_ns for it in self.followed])
+
     def _make_lag(self, gains: Array, innovations: Array) -> JointLagFilter:
         stds_m = np.array([item.noise_std_m for item in self.followed.values()])
-        in_si = self.units[:, None] * gains / stds_m
+        # An innovation stands until the next one: seldom ones act as weakly as often as they come,
+        # and are noise of a lower frequency.
+        often = self._often()
+        in_si = self.units[:, None] * gains / stds_m * often
+        stds_m = stds_m / np.sqrt(often)
         struts = list(self.followed)
         n, interval_s = self._n, self.interval_ns * 1e-9
         # What the model itself answers to an error of its heights.

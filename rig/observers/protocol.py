@@ -38,10 +38,12 @@ class Start(Struct, frozen=True, gc=False):
     Attributes:
         t_ns: Time of the measurement that it starts with.
         mobility_per_kg: Acceleration of the strut's height per newton in the strut.
+        interval_ns: Time between two measurements; 0 of a strut whose height is not measured.
         delay_ns: Time from a measurement to the arrival of its frame.
         stiffness_per_s2: Decrease of that acceleration per metre of height: of the model's own
             law, its stiffness over the effective mass.
         damping_per_s: The same per m/s.
+        sensors: Further sensors of the strut.
     """
 
     t_ns: int

@@ -25,8 +25,9 @@ class ObserversState(Struct, frozen=True, gc=False):
 class StrutObservers:
     """The observers of a model's struts, in their order.
 
-    Noise-aware observers of struts that move another strut, or that have several sensors, are one
-    filter. All others know their own strut alone.
+    Where a strut with a noise-aware observer moves another one, or has several sensors, all of this
+    kind are one filter, which knows the laws of the other struts. Otherwise, and of any other kind,
+    each knows its own strut alone.
     """
 
     def __init__(self, observers: Sequence[AnyObserver]) -> None:
@@ -44,7 +45,7 @@ class StrutObservers:
         empty at the first start.
         """
         joint = self._make_joint(starts, model)
-        t_ns = max(start.t_ns for start in starts)
+        t_ns = self._newest_ns(starts)
         joint_state = None
         if joint is not None:
             was = before.joint
@@ -60,7 +61,7 @@ class StrutObservers:
     def steady_state(self, starts: Sequence[Start], model: ErrorModel) -> ObserversState:
         """State after a long time without an error."""
         joint = self._make_joint(starts, model)
-        t_ns = max(start.t_ns for start in starts)
+        t_ns = self._newest_ns(starts)
         struts = tuple(
             observer.steady_state(start) for observer, start in zip(self.each, starts, strict=True)
         )
@@ -141,6 +142,11 @@ class StrutObservers:
             struts.append(observer.with_numbers(before, numbers[first:end]))
             first = end
         return self._join(struts, joint)
+
+    def _newest_ns(self, starts: Sequence[Start]) -> int:
+        """Time of the newest height that a joint filter begins with."""
+        pairs = zip(self.each, starts, strict=True)
+        return max((start.t_ns for it, start in pairs if it.height_std_m is not None), default=0)
 
     def _make_joint(self, starts: Sequence[Start], model: ErrorModel) -> JointFilter | None:
         own = [strut for strut, it in enumerate(self.each) if it.force_filter is not None]

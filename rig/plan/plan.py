@@ -350,6 +350,13 @@ def _check_heights(
                 f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
                 f"{name}: {{kind: none}} for a strut whose height is not measured"
             )
+    if all(observer.force_filter is None for observer in observers.values()):
+        for name, observer in observers.items():
+            if observer.height_std_m is not None:
+                raise InputError(
+                    f"{source}: observers.{name}.noise_std_m: its height corrects the filter of "
+                    "other struts, expected one with kind kalman"
+                )
     for name in config.signals.further:
         if not observers[name].fuses_sensors:
             raise InputError(

@@ -649,6 +649,8 @@ def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     linear = linear_model(plant, [strut.free_length_m for strut in plan.struts])
     measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
     observed = [i for i in measured if plan.struts[i].observer.estimates_force]
+    if not observed:
+        return []
     forces = [Unknown(f"the residual force of {names[i]}", i) for i in observed]
     result = observability(linear, measured, forces)
     hidden = [*(item.name for item in result.hidden), *map(_pair, result.confused)]

@@ -15,6 +15,7 @@ from rig.channels.measured_quantities import FORCE, VELOCITY
 from rig.closed_loop.loop import Loop, SampleTiming
 from rig.closed_loop.strut_response import linearise_at
 from rig.observers import OBSERVERS
+from rig.observers.error_filter import ErrorFilter
 from rig.observers.joint_filter import JointFilter
 from rig.observers.joint_model import FollowedStrut, JointModel
 from rig.observers.protocol import REFERENCE_HEIGHT, Innovation, Start
@@ -265,3 +266,43 @@ def test_another_force_limit_holds_from_the_next_tick_on(car):
 
 def replace_limit(made, limit_n):
     return dataclasses.replace(made, force_limit_n=limit_n)
+
+
+@pytest.mark.parametrize("bandwidth_hz", [10.0, 60.0])
+def test_a_height_that_is_measured_seldom_does_not_slow_down_the_others(car, bandwidth_hz):
+    """A tyre's height every 20 ms below a suspension's every millisecond."""
+    starts = starts_of(car)
+    starts[0] = replace(starts[0], interval_ns=20 * MS)
+    followed = [
+        FollowedStrut(0, NOISE_M, None),
+        FollowedStrut(1, NOISE_M, ErrorFilter(bandwidth_hz, NOISE_M)),
+    ]
+    seldom = JointFilter(JointModel(car, starts, followed))
+    often = JointFilter(joint_of(car, ("measured", "kalman"), bandwidth_hz))
+    stds = []
+    for joint, every in ((seldom, 20), (often, 1)):
+        rng, state = np.random.default_rng(4), joint.steady_state(0)
+        for tick in range(1, 1501):
+            t_ns = tick * MS
+            noise = NOISE_M * rng.standard_normal(2)
+            seen = [Innovation(value, t_ns) for value in noise.tolist()]
+            seen[0] = seen[0] if tick % every == 0 else None
+            state = joint.step(state, t_ns, seen, [[], []], [1e4] * 2)
+            state = replace(state, inputs=((t_ns, np.zeros(2)),), used=())
+        stds.append(state.struts[1].force_std_n)
+    assert stds[1] < stds[0] < 3.0 * stds[1]
+
+
+def test_an_unknown_deviation_stays_unknown_beside_a_joint_filter(car):
+    observers = StrutObservers([observer("pi"), observer()])
+    state = observers.init(starts_of(car), car, ObserversState())
+    assert math.isnan(state.struts[0].force_std_n)
+    assert math.isfinite(state.struts[1].force_std_n)
+
+
+def test_a_filter_begins_with_its_own_heights(car):
+    """Not with the tick at which the model starts, where a strut without a height begins."""
+    starts = starts_of(car)
+    starts[0] = replace(starts[0], t_ns=30 * MS, interval_ns=0)
+    state = StrutObservers([observer("none"), observer()]).init(starts, car, ObserversState())
+    assert state.joint.point.t_ns == starts[1].t_ns
