@@ -290,7 +290,8 @@ class FreeModelEstimator:
         model = self._plant.init(heights, velocities, t_ns * 1e-9, inputs)
         no_forces = (0.0,) * len(first)
         loaded = self._plant.load(model, no_forces, inputs, state.temperature_c)
-        moves = linearise(self._plant, model, self._at_rest(inputs))
+        still = self._at_rest(inputs)
+        moves = linearise(self._plant, model, still)
         starts = [
             self._start_of_strut(strut, first[strut], t_ns, response)
             for strut, response in enumerate(moves.responses())
@@ -306,8 +307,7 @@ class FreeModelEstimator:
             longest_gaps_ns=longest_gaps_ns,
             bands=state.bands or (InnovationBand(),) * len(first),
             input_noises=tuple(
-                self._input_noise(model, self._at_rest(inputs), column, gains)
-                for _, column, gains in self._motions
+                self._input_noise(model, still, column, gains) for _, column, gains in self._motions
             ),
         )
         started = self.unsettle(started, t_ns)

@@ -41,37 +41,30 @@ def linearise(plant: AnyPlant, state: ModelState, inputs: Sequence[float]) -> Er
     at[n:] = 0.0
     no_forces = np.zeros(struts)
 
-    def respond(change: Array, forces_n: Array) -> Array:
-        """Heights, accelerations of the coordinates and forces of the laws after a change."""
+    def changed(change: Array) -> ModelState:
         numbers = at.copy()
-        numbers[: 2 * n] += change
-        changed = plant.state_of(numbers.tolist(), 0.0, inputs)
-        loaded = plant.load(changed, forces_n.tolist(), inputs, AMBIENT_C)
+        numbers[: len(change)] += change
+        return plant.state_of(numbers.tolist(), 0.0, inputs)
+
+    def heights_m(positions: Array) -> Array:
+        return np.array([height_m for height_m, _ in changed(positions).struts])
+
+    def respond(change: Array, forces_n: Array) -> Array:
+        """Accelerations of the coordinates and forces of the laws after a change."""
+        loaded = plant.load(changed(change), forces_n.tolist(), inputs, AMBIENT_C)
         soon = np.array(plant.numbers(plant.step(loaded, _SHORT_S, inputs)))
-        rates = (soon[n : 2 * n] - numbers[n : 2 * n]) / _SHORT_S
-        heights_m = [height_m for height_m, _ in changed.struts]
-        return np.concatenate([heights_m, rates, loaded.forces_n])
+        rates = (soon[n : 2 * n] - change[n:]) / _SHORT_S
+        return np.concatenate([rates, loaded.forces_n])
 
-    def split(response: Array) -> list[Array]:
-        return np.split(response, [struts, struts + n])
-
-    slightly = [_SECANT_M] * n
-    heights, _, _ = split(
-        central_differences(lambda u: respond(_motion(u, n), no_forces), slightly)
-    )
+    heights = central_differences(heights_m, [_SECANT_M] * n)
     # A coordinate that turns a long arm by a small angle moves a strut as far as one that slides.
     largest = np.abs(heights).max(axis=0, initial=0.0)
     reach = np.where(largest > 0.0, largest, 1.0)
     widths = np.concatenate([_SECANT_M / reach, USUAL_SPEED_M_PER_S / reach]).tolist()
-    _, motion, laws = split(central_differences(lambda u: respond(u, no_forces), widths))
-    _, by_force, _ = split(
-        central_differences(lambda u: respond(np.zeros(2 * n), u), [_SECANT_N] * struts)
-    )
+    by_motion = central_differences(lambda u: respond(u, no_forces), widths)
+    by_force = central_differences(lambda u: respond(np.zeros(2 * n), u), [_SECANT_N] * struts)[:n]
+    motion, laws = by_motion[:n], by_motion[n:]
     return ErrorModel(motion - by_force @ laws, laws, by_force, heights)
-
-
-def _motion(positions: Array, n: int) -> Array:
-    return np.concatenate([positions, np.zeros(n)])
 
 
 def laws_by_motion(

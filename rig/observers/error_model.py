@@ -1,4 +1,4 @@
-"""How the error of a model moves: what the observers of its struts are told of it."""
+"""How the error of a model moves: what the observers of its struts start with."""
 
 from typing import NamedTuple
 

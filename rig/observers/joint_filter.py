@@ -138,13 +138,15 @@ class JointFilter:
         self._fadings = {
             strut: scale_fading(model.starts[strut].interval_ns) for strut in model.followed
         }
-        self.struts = struts = list(model.followed)
+        self.followed = struts = list(model.followed)
         """Indices of the struts whose heights are followed."""
         self._no_limits_n = np.full(len(struts), np.inf)
         intervals_ns = np.array([model.starts[strut].interval_ns for strut in struts])
         corners = np.minimum(model.fastest, MOST_PER_INTERVAL * 1e9 / intervals_ns)[:, None]
-        wanted = corners**2 * model.heights[struts] + 2.0 * DAMPING * corners * model.rates[struts]
-        self._required = model.forces_by_accelerations(struts) @ wanted + model.residuals[struts]
+        feedback = (
+            corners**2 * model.heights[struts] + 2.0 * DAMPING * corners * model.rates[struts]
+        )
+        self._required = model.forces_by_accelerations(struts) @ feedback + model.residuals[struts]
 
     def init(self, t_ns: int) -> JointState:
         """State at the model's start, at the first measured heights."""
@@ -159,21 +161,19 @@ class JointFilter:
 
         A sensor that was left out has to prove itself as before.
         """
-        begun = self.init(t_ns)
-        lag = self._model.lag.init(t_ns, before.lag)
-        health = {
-            channel: SensorHealth(t_ns, is_out=before.health[channel].is_out)
-            for channel in begun.health
-        }
-        return self._conclude(replace(begun, lag=lag, health=health), t_ns, self._no_limits_n)
+        return self._begin(t_ns, self._model.prior(), before)
 
-    def _begin(self, t_ns: int, covariance: Array) -> JointState:
-        model = self._model
+    def _begin(self, t_ns: int, covariance: Array, before: JointState | None = None) -> JointState:
+        model, known = self._model, {} if before is None else before.health
         point = Point(t_ns, np.zeros(model.size), covariance)
         inputs = ((t_ns, np.zeros(len(model.followed))),)
         references = tuple(Reference(start.t_ns, start.t_ns) for start in model.starts)
-        health = {channel: SensorHealth(t_ns) for channel in self._sensors}
-        lag, no_forces_n2 = model.lag.init(t_ns), np.zeros((0, 0))
+        health = {
+            channel: SensorHealth(t_ns, is_out=channel in known and known[channel].is_out)
+            for channel in self._sensors
+        }
+        lag = model.lag.init(t_ns, None if before is None else before.lag)
+        no_forces_n2 = np.zeros((0, 0))
         state = JointState(
             self, point, model.motion, inputs, (), references, health, lag, (), no_forces_n2
         )
@@ -194,7 +194,7 @@ class JointFilter:
         new = [
             (item, strut)
             for strut, item in enumerate(innovations)
-            if item is not None and strut in self._fadings
+            if item is not None and strut in self._model.followed
         ]
         new += [(item, strut) for strut, items in enumerate(further) for item in items]
         new.sort(key=lambda entry: entry[0].t_ns)
@@ -225,7 +225,7 @@ class JointFilter:
             point = after
         lag, newest_ns = state.lag, max(references[strut].t_ns for strut in self._model.own)
         if 2 * (newest_ns - lag.t_ns) >= self._model.interval_ns:
-            new_m = np.array([references[strut].new_m for strut in self._fadings])
+            new_m = np.array([references[strut].new_m for strut in self.followed])
             lag = self._model.lag.update(lag, newest_ns, new_m)
         oldest_ns = t_ns - self._oldest_ns
         while used and used[0].reading.t_ns < oldest_ns:
@@ -307,7 +307,7 @@ class JointFilter:
         number = model.grid_index(t_ns) - model.grid_index(point.t_ns)
         covariance = model.force_covariance(model.ahead(point.covariance, number))
         is_disturbed = np.diagonal(covariance) > STEADY_VARIANCE * model.usual_n2
-        is_disturbed[self.struts] |= np.abs(virtual_n) >= limits_n
+        is_disturbed[self.followed] |= np.abs(virtual_n) >= limits_n
         scales = np.array([reference.scale for reference in state.references])
         roots = np.sqrt(scales)
         covariance *= roots[:, None]
@@ -316,18 +316,18 @@ class JointFilter:
         covariance[own, own] += model.lag.variances_n2(state.lag, scales[own])
         stds_n = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         virtuals_n = np.zeros(len(residuals_n))
-        virtuals_n[self.struts] = virtual_n
+        virtuals_n[self.followed] = virtual_n
         left_out = self._left_out(state.health, t_ns)
         columns = (virtuals_n, residuals_n, stds_n, is_disturbed)
         every = zip(state.references, *(column.tolist() for column in columns), strict=True)
         struts = tuple(
             JointStrut(
-                reference.innovation_m if strut in self._fadings else math.nan,
+                reference.innovation_m if strut in model.followed else math.nan,
                 force_n,
                 residual_n,
                 std_n,
                 # Where no height is used, none is awaited.
-                reference.measured_ns if strut in self._fadings else t_ns,
+                reference.measured_ns if strut in model.followed else t_ns,
                 tuple(channel for channel in left_out if self._sensors[channel].strut == strut),
                 disturbed,
             )
@@ -367,7 +367,7 @@ class JointFilter:
         mean, forces = self._model.of_numbers(numbers)
         since = [since_ns for since_ns, _ in state.inputs]
         struts = list(state.struts)
-        for strut, force_n in zip(self.struts, forces[-1].tolist(), strict=True):
+        for strut, force_n in zip(self.followed, forces[-1].tolist(), strict=True):
             struts[strut] = replace(struts[strut], virtual_force_n=force_n)
         return replace(
             state,

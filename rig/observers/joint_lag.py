@@ -30,14 +30,12 @@ class JointLag(NamedTuple):
 
     Attributes:
         t_ns: Time of the last innovations.
-        innovations_m: These, shape (m,), as large as they would be were the filter steady.
         filtered: Filtered innovations and two derivatives, for each force, shape (p, m, 3).
         square_n2: Mean square of each force's lag, shape (p,).
         peak_n2: Fading peak of that square, shape (p,).
     """
 
     t_ns: int
-    innovations_m: Array
     filtered: Array
     square_n2: Array
     peak_n2: Array
@@ -86,14 +84,13 @@ class JointLagFilter:
 
     def init(self, t_ns: int, before: JointLag | None = None) -> JointLag:
         """Lag at a start; it keeps the squares that there were before."""
-        nothing = np.zeros(self._force.shape[1])
         still, none = np.zeros_like(self._force), np.zeros_like(self._white_n2)
         if before is None:
-            return JointLag(t_ns, nothing, still, none, none)
-        return before._replace(t_ns=t_ns, innovations_m=nothing, filtered=still)
+            return JointLag(t_ns, still, none, none)
+        return before._replace(t_ns=t_ns, filtered=still)
 
     def update(self, lag: JointLag, t_ns: int, innovations_m: Array) -> JointLag:
-        """Lag after innovations at a time."""
+        """Lag after innovations at a time, (m,), as large as with a steady filter."""
         number = max(1, round((t_ns - lag.t_ns) / self._interval_ns))
         filtered, square, peak = lag.filtered, lag.square_n2, lag.peak_n2
         put = self._shares[:, None, :] * innovations_m[None, :, None]
@@ -102,7 +99,7 @@ class JointLagFilter:
             new = np.square((self._force * filtered).sum(axis=(1, 2)))
             peak = np.maximum(new, peak - self._fading * peak)
             square = square + self._fading * (new - square)
-        return JointLag(t_ns, innovations_m, filtered, square, peak)
+        return JointLag(t_ns, filtered, square, peak)
 
     def variances_n2(self, lag: JointLag, scales: Array) -> Array:
         """Variance of each force by its lag, beyond what white innovations show, shape (p,).

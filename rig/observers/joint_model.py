@@ -148,6 +148,7 @@ class JointModel:
         self._scaled_forces = force_errors * self.units
         self._push = np.zeros((self.size, len(self.followed)))
         self._push[n : 2 * n] = -model.by_force[:, list(self.followed)]
+        self._generator = self._make_generator()
         self.motion = self.motion_with(model.laws)
         errors = zip(self.heights, self.rates, force_errors, strict=True)
         self.lines = self._make_lines([StrutErrors(*of_strut) for of_strut in errors])
@@ -188,18 +189,23 @@ class JointModel:
             key: SensorLine(row, std, row * self.units / std) for key, (row, std) in found.items()
         }
 
-    def motion_with(self, laws: Array) -> ErrorMotion:
-        """Motion with forces of the struts' laws by coordinates and rates, shape (struts, 2 n)."""
+    def _make_generator(self) -> Array:
+        """Derivative of the state by itself, without what the model does to its coordinates."""
         n, count = self._n, len(self.own)
-        motion = self._model.free + self._model.by_force @ laws
         generator = np.zeros((self.size, self.size))
         generator[:n, n : 2 * n] = np.eye(n)
-        generator[n : 2 * n, : 2 * n] = motion
         generator[n : 2 * n, self.forces] = self._model.by_force[:, self.own]
         forces = generator[2 * n :, 2 * n :]
         forces[:] = np.eye(STATES * count, k=count)
         forgetting = [_FORGETTING * item.omega for item in self._filters.values()]
         np.fill_diagonal(forces, np.negative(forgetting * STATES))
+        return generator
+
+    def motion_with(self, laws: Array) -> ErrorMotion:
+        """Motion with forces of the struts' laws by coordinates and rates, shape (struts, 2 n)."""
+        n, generator = self._n, self._generator.copy()
+        motion = self._model.free + self._model.by_force @ laws
+        generator[n : 2 * n, : 2 * n] = motion
         stiffness, damping = (np.abs(part).sum(axis=1).max() for part in np.hsplit(motion, 2))
         return ErrorMotion(laws, generator, max(math.sqrt(stiffness), float(damping)))
 

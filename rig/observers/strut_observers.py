@@ -87,7 +87,7 @@ class StrutObservers:
                 )
             )
         follower = state.joint.filter
-        limits_n = [self._limits_n[strut] for strut in follower.struts]
+        limits_n = [self._limits_n[strut] for strut in follower.followed]
         joint = follower.step(state.joint, t_ns, innovations, further, limits_n)
         struts = tuple(
             before if _is_joint(observer, joint) else observer.step(before, t_ns, innovation)
@@ -153,11 +153,7 @@ class StrutObservers:
         if not any(model.moves_another(strut) or starts[strut].sensors for strut in own):
             return None
         followed = [
-            FollowedStrut(
-                strut,
-                observer.height_std_m,
-                observer.force_filter,
-            )
+            FollowedStrut(strut, observer.height_std_m, observer.force_filter)
             for strut, observer in enumerate(self.each)
             if observer.height_std_m is not None
         ]

@@ -104,7 +104,7 @@ def test_of_one_strut_it_is_the_filter_of_one_strut(bandwidth_hz, delay, monkeyp
         t_ns = tick * MS
         seen = None if tick % 37 == 0 else Innovation(heights[tick], t_ns - delay_ns)
         alone = one.step(alone, t_ns, seen)
-        state = joint.step(state, t_ns, [seen], [[]], [1e4] * len(joint.struts))
+        state = joint.step(state, t_ns, [seen], [[]], [1e4] * len(joint.followed))
         (found,) = state.struts
         # A thousandth: the one filter has constant gains where the other's come ever closer.
         assert found.virtual_force_n == pytest.approx(alone.virtual_force_n, rel=1e-3, abs=1e-2)
@@ -153,7 +153,7 @@ def test_stated_deviations_are_those_of_the_errors(car, kinds):
             seen[strut] = Innovation(
                 float(row @ (model.units * truth)) + std * rng.standard_normal(), t_ns
             )
-        state = joint.step(state, t_ns, seen, [[], []], [1e4] * len(joint.struts))
+        state = joint.step(state, t_ns, seen, [[], []], [1e4] * len(joint.followed))
         if tick > 2000:
             real = model._scaled_forces @ truth
             found = [it.residual_force_n for it in state.struts]
@@ -176,7 +176,11 @@ def test_a_constant_force_is_found_in_each_strut(car):
         t_ns = tick * MS
         heights = [model.lines[REFERENCE_HEIGHT, strut].row @ truth for strut in (0, 1)]
         state = joint.step(
-            state, t_ns, [Innovation(h, t_ns) for h in heights], [[], []], [1e4] * len(joint.struts)
+            state,
+            t_ns,
+            [Innovation(h, t_ns) for h in heights],
+            [[], []],
+            [1e4] * len(joint.followed),
         )
     assert [it.virtual_force_n for it in state.struts] == pytest.approx([30.0, -50.0], rel=1e-5)
     assert np.abs(heights).max() < 1e-8
@@ -205,7 +209,7 @@ def test_forces_in_balance_with_one_another_have_bounded_variances():
     state = joint.steady_state(0)
     for tick in range(1, 500):
         seen = [Innovation(1e-5, tick * MS)] * 2
-        state = joint.step(state, tick * MS, seen, [[], []], [1e4] * len(joint.struts))
+        state = joint.step(state, tick * MS, seen, [[], []], [1e4] * len(joint.followed))
     assert all(math.isfinite(it.virtual_force_n) for it in state.struts)
     together = state.covariance_n2.sum()
     assert together < 1e-3 * np.diagonal(state.covariance_n2).sum()
@@ -241,14 +245,18 @@ def test_a_further_sensor_narrows_the_force_of_its_strut(car, quantity, noise_st
     for tick in range(1, 300):
         seen = [Innovation(0.0, tick * MS)] * 2
         state = joint.step(
-            state, tick * MS, seen, [[], [Innovation(0.0, tick * MS, 4)]], [1e4] * len(joint.struts)
+            state,
+            tick * MS,
+            seen,
+            [[], [Innovation(0.0, tick * MS, 4)]],
+            [1e4] * len(joint.followed),
         )
-        without = plain.step(without, tick * MS, seen, [[], []], [1e4] * len(plain.struts))
+        without = plain.step(without, tick * MS, seen, [[], []], [1e4] * len(plain.followed))
     assert state.struts[1].force_std_n < share * without.struts[1].force_std_n
 
 
 def test_another_force_limit_holds_from_the_next_tick_on(car):
-    """A state of observers that differ in their limits alone goes on."""
+    """A state of observers that differ in their limits alone continues."""
     wide, narrow = (
         StrutObservers([replace_limit(observer(), limit_n), observer("measured")])
         for limit_n in (1e4, 3.0)
