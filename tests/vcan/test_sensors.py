@@ -1,12 +1,16 @@
 """Sensors that come without a DBC on the kernel's CAN stack: CANopen by another stack, J1939 by the
 kernel's own and can-utils."""
 
+import errno
 import json
 import shutil
-import subprocess
+import socket
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 
+import can
 import pytest
 
 from tests.sensors.dyno import serve
@@ -25,8 +29,8 @@ from tests.vcan.conftest import in_process
 
 pytestmark = pytest.mark.vcan
 
-NAME = "1122334455667788"
-ASC3 = "0xfe59"
+NAME = 0x1122334455667788
+ASC3 = 0xFE59
 
 
 @pytest.fixture
@@ -64,25 +68,69 @@ def cycle_ms(bus: tuple[str, ...]) -> float:
     return round(wire["pdos"][0]["cycle_s"] * 1e3)
 
 
+@contextmanager
+def sending(channel: str) -> Iterator[None]:
+    """A level sensor's group (ASC3) ten times a second, from the address that is claimed for `NAME`.
+
+    By a thread: in the emulated kernel the clock runs on while a program is loaded, on a loaded
+    machine for seconds.
+    """
+    ended = threading.Event()
+    with socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_J1939) as group:
+        group.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        group.bind((channel, NAME, socket.J1939_NO_PGN, socket.J1939_NO_ADDR))
+        to_all = (channel, socket.J1939_NO_NAME, ASC3, socket.J1939_NO_ADDR)
+
+        def send() -> None:
+            while not ended.wait(0.1):
+                try:
+                    group.sendto(bytes(8), to_all)
+                except OSError as error:
+                    if error.errno != errno.EADDRNOTAVAIL:  # until the address is claimed
+                        raise
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+
+@pytest.mark.skipif(shutil.which("j1939acd") is None, reason="j1939acd of can-utils is missing")
 def test_a_level_sensor_of_the_kernels_j1939(second_vcan, tmp_path):
-    for tool in ("j1939acd", "testj1939"):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is not installed; it is part of can-utils")
-    claims = ["j1939acd", "-r", "128-140", "-c", tmp_path / "name.jacd", NAME, second_vcan]
+    claims = [
+        "j1939acd",
+        "-r",
+        "128-140",
+        "-c",
+        tmp_path / "name.jacd",
+        f"{NAME:016x}",
+        second_vcan,
+    ]
     bus = ("--interface", "socketcan", "--channel", second_vcan)
-    with running(claims):
-        send = ["testj1939", "-B", "-s8", f"{second_vcan}:,{ASC3},0x{NAME}", f":,{ASC3}"]
-        for _ in range(100):  # sending fails until the address is claimed
-            if subprocess.run(send, check=False, timeout=60.0).returncode == 0:
-                break
-            time.sleep(0.1)
-        with running(["sh", "-c", f"while true; do {' '.join(send)}; sleep 0.1; done"]):
-            out = tmp_path / "found"
-            text = rig("sensor", "scan", *bus, "--listen-s", 1.0, "--json", "--out", out)
+    out = tmp_path / "found"
+    listener = can.Bus(channel=second_vcan, interface="socketcan")
+    with listener, running(claims), sending(second_vcan):
+        assert any(is_level(message) for message in received(listener, 60.0))
+        text = rig("sensor", "scan", *bus, "--listen-s", 1.0, "--json", "--out", out)
     found = json.loads(text)
     (claim,) = found["claims"]
     address = claim["address"]
     assert 128 <= address <= 140
-    assert claim["name"] == int(NAME, 16)
+    assert claim["name"] == NAME
     assert [item["address"] for item in found["groups"]] == [address]
     assert f"source_address: {address}" in (out / "rig.yaml").read_text()
+
+
+def received(bus: can.BusABC, limit_s: float) -> Iterator[can.Message]:
+    end_s = time.monotonic() + limit_s
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        message = bus.recv(left_s)
+        if message is not None:
+            yield message
+
+
+def is_level(message: can.Message) -> bool:
+    return message.is_extended_id and message.arbitration_id >> 8 & 0xFFFF == ASC3
