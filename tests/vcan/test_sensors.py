@@ -70,7 +70,7 @@ def cycle_ms(bus: tuple[str, ...]) -> float:
 
 @contextmanager
 def sending(channel: str) -> Iterator[None]:
-    """A level sensor's group (ASC3) ten times a second, from the address that is claimed for `NAME`.
+    """A level sensor's group (ASC3) ten times a second, from the address claimed for `NAME`.
 
     By a thread: in the emulated kernel the clock runs on while a program is loaded, on a loaded
     machine for seconds.
