@@ -35,7 +35,8 @@ def force_along(frequencies_hz, delay_s, noise_n=0.0):
     slope = (force(t - delay_s + step_s) - force(t - delay_s - step_s)) / (2.0 * step_s)
     noise = noise_n * np.random.default_rng(1).standard_normal(len(t))
     shown = force(t - delay_s) + noise
-    return ForceOverTime(*motion(t), shown, slope[:, np.newaxis], np.zeros((len(t), 0)))
+    nothing, alone = np.zeros((len(t), 0)), np.ones((len(t), 1))
+    return ForceOverTime(*motion(t), shown, slope[:, np.newaxis], nothing, alone)
 
 
 def test_a_step_finds_the_delay_of_a_force():

@@ -7,6 +7,10 @@ delays and its covariance. Repeated until it converges this is the method of Gau
 
 A single sine determines no delay: whatever is periodic is a function of height and velocity there.
 
+Where there are more struts than coordinates, a motion shows the forces of struts only up to a part
+that is in balance with itself: in the force of one are shares of the others', whose functions are
+fitted together then.
+
 References:
     Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973), projection of linear parameters.
     Dahl, A solid friction model, Aerospace Corporation TOR-0158 (1968).
@@ -41,6 +45,9 @@ _FRICTION_OF_STROKE = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 micrometres to a soft seal. Without friction among the functions, its hysteresis is taken for a
 delay; with only three of them, some 0.1 ms of it were."""
 
+_NO_SHARE = 1e-9
+"""Share of another strut's force that is rounding."""
+
 _LEAST_SHARE = 0.03
 """Of the derivative's power that the functions must not be able to give. Of one sine they leave
 1e-5, with friction 0.002; of seven sines 0.3, with a stop, whose rise they can give, 0.09."""
@@ -54,7 +61,10 @@ class ForceOverTime(NamedTuple):
         velocity_m_per_s: Shape (N,).
         force_n: With the delays as they are assumed, shape (N,).
         by_delays: Its derivatives by them, shape (N, delays).
-        further: Other signals that the force may be proportional to, shape (N, signals).
+        further: Signals that may be in the forces of all struts in one proportion each (a mass that
+            is not quite known): their parts in this one's, shape (N, signals).
+        shares: Share of each strut's force that is in it, shape (N, struts): at each time the rows
+            of all struts are a projection.
     """
 
     height_m: Array
@@ -62,6 +72,7 @@ class ForceOverTime(NamedTuple):
     force_n: Array
     by_delays: Array
     further: Array
+    shares: Array
 
 
 class DelayStep(NamedTuple):
@@ -72,39 +83,112 @@ class DelayStep(NamedTuple):
 
 
 def delay_step(struts: Sequence[ForceOverTime]) -> DelayStep:
-    """Errors of delays that the forces of all struts show together."""
-    residuals: list[Array] = []
-    directions: list[Array] = []
-    slopes: list[Array] = []
-    for strut in struts:
-        rows = np.column_stack([_functions(strut.height_m, strut.velocity_m_per_s), strut.further])
-        rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-        values, vectors = np.linalg.eigh(rows.T @ rows)
-        kept = values > _RANK * values[-1]
-        basis = rows @ (vectors[:, kept] / np.sqrt(values[kept]))
-        both = np.column_stack([strut.force_n, strut.by_delays])
-        left = both - basis @ (basis.T @ both)
-        scale = 1.0 / max(float(np.std(left[:, 0])), 1e-300)
-        residuals.append(scale * left[:, 0])
-        directions.append(scale * left[:, 1:])
-        slopes.append(scale * strut.by_delays)
-    residual, direction = np.concatenate(residuals), np.vstack(directions)
-    power = np.sum(np.vstack(slopes) ** 2, axis=0)
+    """Errors of delays that the forces of all struts show together.
+
+    A strut whose force is not finite is left out.
+    """
+    known = [i for i, strut in enumerate(struts) if np.all(np.isfinite(strut.force_n))]
+    forces = _Forces.of([struts[i]._replace(shares=struts[i].shares[:, known]) for i in known])
+    left = forces.left(np.ones(len(known)))
+    # Where the functions leave more, errors are larger.
+    weights = 1.0 / np.maximum(left[..., 0].std(axis=1), 1e-300)
+    left, slopes = (
+        (weights[:, np.newaxis, np.newaxis] * part).reshape(-1, part.shape[2])
+        for part in (forces.left(weights), forces.both[..., 1:])
+    )
+    residual, direction = left[:, 0], left[:, 1:]
     delays = direction.shape[1]
     steps, stds = np.zeros(delays), np.full(delays, np.inf)
-    gram = direction.T @ direction
-    own = np.array([_own_power(gram, i) for i in range(delays)])
-    known = np.flatnonzero(own > _LEAST_SHARE * power)
-    if not len(known):
+    gram, whole = direction.T @ direction, slopes.T @ slopes
+    determined = [_own_power(gram, i) > _LEAST_SHARE * _own_power(whole, i) for i in range(delays)]
+    which = np.flatnonzero(determined)
+    if not len(which):
         return DelayStep(steps, stds)
-    inverse = np.linalg.inv(gram[np.ix_(known, known)])
-    steps[known] = -inverse @ (direction[:, known].T @ residual)
+    inverse = np.linalg.inv(gram[np.ix_(which, which)])
+    steps[which] = -inverse @ (direction[:, which].T @ residual)
     # Correlated errors: the variance of a product's sum, from its own spectrum at zero, with what
     # the fit leaves as error.
-    errors = (residual + direction[:, known] @ steps[known])[:, np.newaxis] * direction[:, known]
+    errors = (residual + direction[:, which] @ steps[which])[:, np.newaxis] * direction[:, which]
     covariance = inverse @ _long_run_covariance(errors) @ inverse
-    stds[known] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    stds[which] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return DelayStep(steps, stds)
+
+
+class _Forces(NamedTuple):
+    """Forces of struts and what may be in them.
+
+    Attributes:
+        both: Forces and their derivatives by the delays, shape (struts, N, 1 + delays).
+        functions: Of the motion of each strut, shapes (N, functions).
+        shares: Share of the force of a strut (last) in another's, shape (struts, N, struts).
+        further: Signals that may be in all forces in one proportion, shape (struts, N, signals).
+    """
+
+    both: Array
+    functions: list[Array]
+    shares: Array
+    further: Array
+
+    @classmethod
+    def of(cls, struts: Sequence[ForceOverTime]) -> "_Forces":
+        return cls(
+            np.array([np.column_stack([it.force_n, it.by_delays]) for it in struts]),
+            [_functions(it.height_m, it.velocity_m_per_s) for it in struts],
+            np.array([it.shares for it in struts]),
+            np.array([it.further for it in struts]),
+        )
+
+    def left(self, weights: Array) -> Array:
+        """What functions and further signals leave of the forces, weighted by strut, as `both`.
+
+        With the matrix P of shares at a time and weights W, the functions F of a strut i are
+        P[:, i] F in all forces: the product of two of them is F times (PᵀW²P)[i, j] times F.
+        """
+        squares = weights[:, np.newaxis, np.newaxis] ** 2
+        weighted = squares * self.shares
+        metric = np.einsum("rki,rkj->ijk", weighted, self.shares)
+        linked = np.abs(metric).max(axis=2) > _NO_SHARE * np.abs(metric).max()
+        products = np.block(
+            [
+                [
+                    a.T @ (metric[i, j, :, np.newaxis] * b)
+                    if linked[i, j]
+                    else np.zeros((a.shape[1], b.shape[1]))
+                    for j, b in enumerate(self.functions)
+                ]
+                for i, a in enumerate(self.functions)
+            ]
+        )
+        targets = np.concatenate([self.further, self.both], axis=2)
+        with_targets = np.vstack(
+            [
+                a.T @ np.einsum("rk,rkm->km", weighted[..., i], targets)
+                for i, a in enumerate(self.functions)
+            ]
+        )
+        signals = self.further.shape[2]
+        among = np.einsum("rkm,rkn->mn", squares * self.further, targets)
+        gram = np.block(
+            [
+                [products, with_targets[:, :signals]],
+                [with_targets[:, :signals].T, among[:, :signals]],
+            ]
+        )
+        against = np.vstack([with_targets[:, signals:], among[:, signals:]])
+        coefficients = _solve_projection(gram, against)
+        ends = np.cumsum([rows.shape[1] for rows in self.functions])
+        *own, rest = np.split(coefficients, ends)
+        given = np.array([rows @ part for rows, part in zip(self.functions, own, strict=True)])
+        return self.both - np.einsum("rks,skm->rkm", self.shares, given) - self.further @ rest
+
+
+def _solve_projection(gram: Array, against: Array) -> Array:
+    """Coefficients of least squares by products of columns, some of which may be alike."""
+    norm = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(norm, norm))
+    kept = values > _RANK * values[-1]
+    basis = vectors[:, kept] / np.sqrt(values[kept])
+    return (basis @ (basis.T @ (against / norm[:, np.newaxis]))) / norm[:, np.newaxis]
 
 
 def delay_between(late: Array, course: Array, step_s: float) -> tuple[float, float]:

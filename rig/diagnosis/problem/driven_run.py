@@ -25,6 +25,8 @@ class DrivenRun(NamedTuple):
     Attributes:
         drive: What drove it.
         fine: Input vector at half sub-steps, shape (2 * substeps * (N - 1) + 1, inputs).
+        reference: Positions of moved bodies there about which the mechanism is linear, shape (as
+            above, motions): along its table those that were measured, else zero.
         moved: What moved bodies add to heights and to their rates there, shape (as above, 2,
             struts); empty where no body is moved.
         angle: Angle by which the fastest motion turns within such a step.
@@ -35,6 +37,7 @@ class DrivenRun(NamedTuple):
     grid: RecordingGrid
     drive: Drive
     fine: Array
+    reference: Array
     moved: Array
     substeps: int
     angle: float
@@ -68,6 +71,7 @@ class DrivenRun(NamedTuple):
         return self._replace(
             grid=grid,
             fine=self.fine[fine],
+            reference=self.reference[fine],
             moved=self.moved[fine],
             mechanism=self.mechanism.cut(nodes),
             cells=cells,
@@ -76,23 +80,29 @@ class DrivenRun(NamedTuple):
     def finer(self) -> "DrivenRun":
         """The recording with steps half as long."""
         steps = 2 * self.substeps
-        spline = CubicSpline(fine_times(self.grid.t_s, steps), self.fine)
-        fine = np.ascontiguousarray(spline(fine_times(self.grid.t_s, 2 * steps)))
-        moved = _moved(self.drive, self.mechanism, fine)
-        return self._replace(fine=fine, moved=moved, substeps=steps, angle=0.5 * self.angle)
+        before_s, times = (fine_times(self.grid.t_s, by * steps) for by in (1, 2))
+        fine, reference = (
+            np.ascontiguousarray(CubicSpline(before_s, values)(times))
+            for values in (self.fine, self.reference)
+        )
+        finer = self._replace(reference=reference, substeps=steps, angle=0.5 * self.angle)
+        return finer.driven_by(fine)
 
     def before_delays(self, delays_s: Array) -> "DrivenRun":
         """The recording with its inputs as they were, measured with a delay each, (inputs,)."""
         if not np.any(delays_s):
             return self
         times = fine_times(self.grid.t_s, 2 * self.substeps)
-        fine = np.ascontiguousarray(self.drive.before_delays(times, delays_s))
-        return self._replace(fine=fine, moved=_moved(self.drive, self.mechanism, fine))
+        return self.driven_by(np.ascontiguousarray(self.drive.before_delays(times, delays_s)))
 
     def disturbed(self, noise: Array) -> "DrivenRun":
         """The recording with other inputs, the difference given as `fine`."""
-        fine = self.fine + noise
-        return self._replace(fine=fine, moved=_moved(self.drive, self.mechanism, fine))
+        return self.driven_by(self.fine + noise)
+
+    def driven_by(self, fine: Array) -> "DrivenRun":
+        """The recording with another input vector, as `fine`."""
+        moved = _moved(self.drive, self.mechanism, fine, self.reference)
+        return self._replace(fine=fine, moved=moved)
 
 
 def track_of(motion: Trajectory, run: DrivenRun) -> Track:
@@ -117,11 +127,15 @@ def driven_run(
     usual = grid.step_s
     substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))
     fine = np.ascontiguousarray(drive.at(fine_times(grid.t_s, 2 * substeps)), dtype=np.float64)
+    reference = (
+        fine[:, drive.moved] if mechanism.is_tabulated else np.zeros((len(fine), len(drive.moved)))
+    )
     return DrivenRun(
         grid,
         drive,
         fine,
-        _moved(drive, mechanism, fine),
+        reference,
+        _moved(drive, mechanism, fine, reference),
         substeps,
         fastest * usual / substeps,
         mechanism,
@@ -129,22 +143,20 @@ def driven_run(
     )
 
 
-def _moved(drive: Drive, mechanism: LinearisedMechanism, fine: Array) -> Array:
+def _moved(drive: Drive, mechanism: LinearisedMechanism, fine: Array, reference: Array) -> Array:
     """What moved bodies add to heights and to their rates, as `DrivenRun.moved`."""
-    positions = drive.moved
-    if not positions:
+    if not drive.moved:
         return np.empty((0, 2, mechanism.heights_m.shape[1]))
     jacobian = mechanism.moved
-    if len(jacobian) == 1:
-        parts = [fine[:, [first + rate for first in positions]] @ jacobian[0].T for rate in (0, 1)]
-        return np.ascontiguousarray(np.stack(parts, axis=1))
-    # The heights of the table have the motion; their rates are those of the free coordinates.
-    share = np.linspace(0.0, len(jacobian) - 1.0, len(fine))
-    before = np.minimum(share.astype(np.int64), len(jacobian) - 2)
-    share = (share - before)[:, np.newaxis, np.newaxis]
-    between = jacobian[before] + share * (jacobian[before + 1] - jacobian[before])
-    rates = np.einsum("kij,kj->ki", between, fine[:, [first + 1 for first in positions]])
-    return np.ascontiguousarray(np.stack([np.zeros_like(rates), rates], axis=1))
+    if mechanism.is_tabulated:
+        share = np.linspace(0.0, len(jacobian) - 1.0, len(fine))
+        before = np.minimum(share.astype(np.int64), len(jacobian) - 2)
+        share = (share - before)[:, np.newaxis, np.newaxis]
+        jacobian = jacobian[before] + share * (jacobian[before + 1] - jacobian[before])
+    positions = fine[:, drive.moved] - reference
+    rates = fine[:, [first + 1 for first in drive.moved]]
+    both = np.stack([positions, rates], axis=1)
+    return np.ascontiguousarray(both @ np.swapaxes(jacobian, 1, 2))
 
 
 def first_motion(grid: RecordingGrid) -> tuple[Array, Array]:

@@ -325,62 +325,104 @@ class FreeRunProblem(Problem):
 
     def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """The force that would make the residual vanish, along the smoothed motion."""
-        run, parts = self._before_delays(k, model), model.parts
-        motion = self.simulate(run, model, parts.starts[k])
-        m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
-        if motion is None or m is None:
+        smoothed = self._smooth_motion(k, model)
+        if smoothed is None:
             return None
-        residual = self._residual_states(k, model, motion)
-        z, w, a = (
-            b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(motion)
-        )
-        along = track_of(Trajectory(z, w, a), run)
+        run, motion, spread = smoothed
+        needed = self._needed_forces(run, motion, model.parts.linear)
+        m = linear_part.with_linear_changes(run.mechanism, self.linear, model.parts.linear)
+        if needed is None or m is None:
+            return None
+        along = track_of(motion, run)
         forces = track.strut_forces(self, model, along, self.states(k, model))
-        needed = m.strut_forces_of_motion(z, w, a, run.inputs, run.moved_at_nodes)
-        spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
-        constants = strut_constants(self, parts.linear)
+        constants = strut_constants(self, model.parts.linear)
         inertia = m.strut_inertia()
         deviation = (
             spread[2] @ inertia.T + constants[:, 2] * spread[1] + constants[:, 1] * spread[0]
         )
-        acting = m.without_balance(forces.T).T
-        return ResidualForces(run.grid.name, along, needed.T - acting, deviation.T)
+        acting = m.without_balance(forces.T)
+        return ResidualForces(run.grid.name, along, (needed - acting).T, deviation.T)
+
+    def _smooth_motion(
+        self, k: int, model: CandidateModel
+    ) -> tuple[DrivenRun, Trajectory, list[Array]] | None:
+        """The measured motion before the delays of a model, smoothed about its free run.
+
+        With the recording before these delays, and the standard deviations of heights, velocities
+        and accelerations, each (N, struts). None where the model runs away.
+        """
+        run = self._before_delays(k, model)
+        motion = self.simulate(run, model, model.parts.starts[k])
+        if motion is None:
+            return None
+        residual = self._residual_states(k, model, motion)
+        smoothed = Trajectory(
+            *(b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(motion))
+        )
+        spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
+        return run, smoothed, spread
+
+    def _needed_forces(self, run: DrivenRun, motion: Trajectory, linear: Array) -> Array | None:
+        """Strut forces (N, struts) that a motion takes with changes of the linear part."""
+        m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
+        if m is None:
+            return None
+        return m.strut_forces_of_motion(*motion, run.inputs, run.moved_at_nodes)
 
     def forces_over_time(
         self, k: int, model: CandidateModel, delays: Sequence[int]
     ) -> Sequence[ForceOverTime] | None:
-        """The force that the smoothed motion takes in each strut."""
-        here = self._needed_forces(k, model)
+        """The force that the smoothed motion takes in each strut, balanced forces left out."""
         step_s = max(_FORCE_STEP_S, self.runs[k].grid.step_s)
-        slopes: list[Array] = []
-        for delay in delays:
-            ends: list[Array] = []
-            for sign in (1.0, -1.0):
-                linear = model.parts.linear.copy()
-                linear[delay] += sign * step_s
-                moved = self._needed_forces(k, model.with_linear(linear))
-                if moved is None:
-                    return None
-                ends.append(moved[1])
-            slopes.append((ends[0] - ends[1]) / (2.0 * step_s))
-        if here is None:
+        masses = [i for i, p in enumerate(self.linear) if p.kind == "mass"]
+        try:
+            run, motion, force_n = self._smooth_forces(k, model)
+            by_delays = np.stack(
+                [
+                    self._smooth_forces(k, model.with_linear(later))[2]
+                    - self._smooth_forces(k, model.with_linear(earlier))[2]
+                    for later, earlier in (
+                        [_changed(model.parts.linear, i, sign * step_s) for sign in (1.0, -1.0)]
+                        for i in delays
+                    )
+                ],
+                axis=-1,
+            )
+        except FloatingPointError:
             return None
-        along, force_n = here
-        # A mass that is not quite known makes a force in proportion to its acceleration.
-        accelerations = np.gradient(along.velocities_m_per_s, along.t_s, axis=1).T
-        motion = zip(along.heights_m, along.velocities_m_per_s, force_n, strict=True)
+        by_masses = np.zeros((*force_n.shape, 0))
+        if masses:
+            heavier = [
+                self._needed_forces(run, motion, _changed(model.parts.linear, i, 1.0))
+                for i in masses
+            ]
+            by_masses = np.stack([it - force_n for it in heavier if it is not None], axis=-1)
+        shares = run.mechanism.shares_seen(len(force_n))
         return [
-            ForceOverTime(z, w, force, np.column_stack([it[i] for it in slopes]), accelerations)
-            for i, (z, w, force) in enumerate(motion)
+            ForceOverTime(
+                motion.heights_m[:, i],
+                motion.velocities_m_per_s[:, i],
+                force_n[:, i],
+                by_delays[:, i] / (2.0 * step_s),
+                by_masses[:, i],
+                shares[:, i],
+            )
+            for i in range(force_n.shape[1])
         ]
 
-    def _needed_forces(self, k: int, model: CandidateModel) -> tuple[Track, Array] | None:
-        """The smoothed motion, and the force that it takes in each strut, shape (struts, N)."""
-        residual = self.residual_forces(k, model)
-        if residual is None:
-            return None
-        law_n = track.strut_forces(self, model, residual.track, self.states(k, model))
-        return residual.track, residual.force_n + law_n
+    def _smooth_forces(self, k: int, model: CandidateModel) -> tuple[DrivenRun, Trajectory, Array]:
+        """A smoothed motion, with its recording and the forces (N, struts) that it takes.
+
+        Raises:
+            FloatingPointError: The model runs away.
+        """
+        smoothed = self._smooth_motion(k, model)
+        if smoothed is not None:
+            run, motion, _ = smoothed
+            force_n = self._needed_forces(run, motion, model.parts.linear)
+            if force_n is not None:
+                return run, motion, force_n
+        raise FloatingPointError(self.runs[k].grid.name)
 
     def _residual_states(self, k: int, model: CandidateModel, motion: Trajectory) -> list[Smoothed]:
         """Measured less simulated motion, smoothed, before the sensors' delays."""
@@ -629,6 +671,13 @@ class FreeRunProblem(Problem):
                 delay = delay_between(cells_n[:, i], forces[:, i], run.grid.step_s)
                 found.setdefault(i, []).append(delay)
         return {i: _weighted_mean(delays) for i, delays in found.items()}
+
+
+def _changed(values: Array, index: int, change: float) -> Array:
+    """Values of which one is changed."""
+    changed = values.copy()
+    changed[index] += change
+    return changed
 
 
 def _without(columns: Array, signals: Sequence[Array]) -> list[Array]:

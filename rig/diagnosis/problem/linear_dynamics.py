@@ -32,7 +32,7 @@ class FilterMechanism:
         self, mechanism: LinearisedMechanism, nodes_s: Array, t_s: Array, inputs: Array
     ) -> None:
         at = np.zeros(len(t_s), dtype=np.int64)
-        if len(mechanism.q) > 1:
+        if mechanism.is_tabulated:
             at = np.clip(np.searchsorted(nodes_s, t_s - 1e-12), 0, len(nodes_s) - 1)
         self._mechanism, self._at, self._inputs = mechanism, at, inputs
         self.jacobian = mechanism.jacobian[at]

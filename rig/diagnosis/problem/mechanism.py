@@ -63,9 +63,16 @@ class LinearisedMechanism(NamedTuple):
         """Number of coordinates."""
         return self.q.shape[1]
 
+    @property
+    def is_tabulated(self) -> bool:
+        """Whether it is given at nodes, and not the same everywhere."""
+        return len(self.q) > 1
+
     def cut(self, nodes: slice) -> "LinearisedMechanism":
         """The mechanism at some of the nodes."""
-        return self if len(self.q) == 1 else LinearisedMechanism(*(part[nodes] for part in self))
+        return (
+            self if not self.is_tabulated else LinearisedMechanism(*(part[nodes] for part in self))
+        )
 
     def strut_forces_of_motion(
         self, z: Array, w: Array, a: Array, inputs: Array, moved: Array
@@ -79,7 +86,7 @@ class LinearisedMechanism(NamedTuple):
             inputs: Input vector, shape (N, inputs).
             moved: What moved bodies add to heights and their rates, shape (N, 2, struts).
         """
-        every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
+        every = np.arange(len(z)) if self.is_tabulated else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
         q = self.q[every] + solve_nearest(jacobian, z - self.heights_m[every] - moved[:, 0])
         v = solve_nearest(jacobian, w - moved[:, 1])
@@ -98,9 +105,17 @@ class LinearisedMechanism(NamedTuple):
         _, struts, n = self.jacobian.shape
         if struts == n:
             return forces
-        jacobian = self.jacobian[np.arange(len(forces)) if len(self.q) > 1 else slice(None)]
-        transposed = np.swapaxes(jacobian, 1, 2)
-        return solve_nearest(transposed, (transposed @ forces[..., np.newaxis])[..., 0])
+        return np.einsum("kij,kj->ki", self.shares_seen(len(forces)), forces)
+
+    def shares_seen(self, nodes: int) -> Array:
+        """Share of each strut's force in each force without balance, (nodes, struts, struts).
+
+        By force and strut. A projection: the identity with as many struts as coordinates.
+        """
+        count = self.jacobian.shape[1]
+        turned = np.swapaxes(self.jacobian, 1, 2)
+        by_strut = [solve_nearest(turned, turned[..., strut]) for strut in range(count)]
+        return np.broadcast_to(np.stack(by_strut, axis=-1), (nodes, count, count))
 
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""

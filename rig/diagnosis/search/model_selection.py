@@ -1,13 +1,14 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
-from collections.abc import Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import effect
+from dart_model.effects import CATALOGUE, effect
 from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.channel_delays import is_undetermined
@@ -17,7 +18,6 @@ from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel
 from rig.diagnosis.search.screen import (
-    Screening,
     as_screening,
     candidate_laws,
     no_law,
@@ -93,43 +93,69 @@ def select_model(
 def _without_superfluous_laws(
     pool: Pool, chosen: ValidatedModel, progress: Progress
 ) -> ValidatedModel:
-    """The model with each law removed, or replaced by a simpler one, where that loses nothing."""
+    """The model with each law removed, or replaced by a simpler one, where that loses nothing.
+
+    A law is also replaced where another formula of what it degenerates to is the better one: in the
+    shape of the last micrometres friction with pre-sliding resembles friction behind play.
+    """
     while True:
+        laws, most = chosen.fit.candidate.new, cache(partial(_most_promising_cost, pool, chosen))
         simpler = (
             other
-            for law in chosen.fit.candidate.new
-            for other in _simpler_models(pool, chosen, law, progress)
+            for law in laws
+            for other in _simpler_models(pool, chosen, law, most, progress)
             if not pool.prefers(chosen, other)
         )
-        other = next(simpler, None)
+        better = (
+            other
+            for law in laws
+            for other in _with_one_of(pool, chosen, law, _neighbours(law[1]), most, progress)
+            if pool.prefers(other, chosen)
+        )
+        other = next(chain(simpler, better), None)
         if other is None:
             return chosen
         chosen = other
 
 
 def _simpler_models(
-    pool: Pool, chosen: ValidatedModel, law: StrutEffect, progress: Progress
+    pool: Pool,
+    chosen: ValidatedModel,
+    law: StrutEffect,
+    most: Callable[[], float],
+    progress: Progress,
 ) -> Iterable[ValidatedModel]:
-    """Models without a law of a chosen one, or with a simpler one for it; fitted on demand."""
+    """Models without a law of a chosen one, or with a simpler one for it; fitted on demand.
+
+    `most` is the largest cost along the motion from which on a fit is not tried.
+    """
     stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
     less = chosen.fit.candidate.without(law)
-
-    most = cache(lambda: _most_promising_cost(pool, chosen))
-
-    def is_promising(screening: Screening | None) -> bool:
-        return screening is not None and screening.validation_cost <= most()
-
     if chosen.size > 1:
         progress(f"fitting without {law[1]}", 0.85)
         # Its first fit may have ended in a side valley, which the larger model has left.
         is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
         is_fitted |= less in pool.converged and less in pool.invalid
-        if not is_fitted and is_promising(
-            refine(stage, less.new, [known[other] for other in less.new])
-        ):
-            pool.attempt(model_for(pool.problem, chosen.fit, less))
+        if not is_fitted:
+            along = refine(stage, less.new, [known[other] for other in less.new])
+            if along is not None and along.validation_cost <= most():
+                pool.attempt(model_for(pool.problem, chosen.fit, less))
         yield from _converge_candidate(pool, less, chosen)
-    for name in effect(law[1]).simpler:
+    yield from _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
+
+
+def _with_one_of(
+    pool: Pool,
+    chosen: ValidatedModel,
+    law: StrutEffect,
+    names: Iterable[str],
+    most: Callable[[], float],
+    progress: Progress,
+) -> Iterable[ValidatedModel]:
+    """Models with another law for one of a chosen one's, in the same strut; fitted on demand."""
+    stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
+    less = chosen.fit.candidate.without(law)
+    for name in names:
         other = (law[0], name)
         if effect(name).linear or other in less.new:
             continue
@@ -137,9 +163,16 @@ def _simpler_models(
         progress(f"fitting {name} instead of {law[1]}", 0.85)
         if candidate not in pool.fits:
             for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
-                if screening.values and is_promising(screening):
+                if screening.values and screening.validation_cost <= most():
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
         yield from _converge_candidate(pool, candidate, chosen)
+
+
+def _neighbours(name: str) -> list[str]:
+    """Laws of other families to which one degenerates, but for those to which it does itself."""
+    own, simpler = effect(name).family, effect(name).simpler
+    families = {effect(other).family for other in simpler if not effect(other).linear} - {own}
+    return [n for n, item in CATALOGUE.items() if item.family in families and n not in simpler]
 
 
 def _most_promising_cost(pool: Pool, model: ValidatedModel) -> float:
