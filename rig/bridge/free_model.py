@@ -16,7 +16,6 @@ from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.tracked_motion import NoiseGains
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import TEMPERATURE
@@ -50,8 +49,9 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
-        input_noises: Of each motion among the inputs the covariance of the laws' forces by its
-            noise, over the mean square of its innovations, N²/m², shape (struts, struts).
+        input_errors: Of each motion among the inputs the covariances of the laws' forces by the
+            noise of its samples and by its lag, over the mean squares of these, N²/m², in rows of
+            shape (struts * struts,).
     """
 
     t_ns: int
@@ -65,7 +65,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
-    input_noises: tuple[Array, ...] = ()
+    input_errors: Array = np.zeros((0, 0))
 
 
 _Received = Sequence[Sample | None]
@@ -149,9 +149,9 @@ class FreeModelEstimator:
                 self._input_of[channel.index] = index
         ends = itertools.accumulate([len(item.values(None, 0)) for item in inputs], initial=0)
         self._motions = tuple(
-            (index, column, noise)
-            for index, (item, column) in enumerate(zip(inputs, ends, strict=False))
-            if (noise := item.noise()) is not None
+            (column, gains)
+            for item, column in zip(inputs, ends, strict=False)
+            if (gains := item.gains) is not None
         )
         self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
         self._silences_ns = [grace + stale_after_ns for grace in self._graces_ns]
@@ -306,9 +306,7 @@ class FreeModelEstimator:
             model=loaded,
             longest_gaps_ns=longest_gaps_ns,
             bands=state.bands or (InnovationBand(),) * len(first),
-            input_noises=tuple(
-                self._input_noise(model, still, column, gains) for _, column, gains in self._motions
-            ),
+            input_errors=self._input_errors(model, still),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, no_forces, self._newest_ns(state))
@@ -316,16 +314,18 @@ class FreeModelEstimator:
     def _at_rest(self, inputs: Sequence[float]) -> tuple[float, ...]:
         """Inputs whose motions stand still where they are."""
         still = list(inputs)
-        for _, column, _ in self._motions:
+        for column, _ in self._motions:
             still[column + 1 : column + 3] = 0.0, 0.0
         return tuple(still)
 
-    def _input_noise(
-        self, model: ModelState, inputs: Sequence[float], column: int, gains: NoiseGains
-    ) -> Array:
-        """Covariance of the laws' forces by the noise of a motion, as of `FreeModelState`."""
-        slopes = laws_by_motion(self._plant, model, inputs, column)
-        return slopes @ gains.covariance @ slopes.T / gains.innovation
+    def _input_errors(self, model: ModelState, inputs: Sequence[float]) -> Array:
+        """Covariances of the laws' forces by errors of the motions, as of `FreeModelState`."""
+        rows: list[Array] = []
+        for column, gains in self._motions:
+            slopes = laws_by_motion(self._plant, model, inputs, column)
+            late = slopes @ gains.lag
+            rows += [(slopes @ gains.noise @ slopes.T).ravel(), np.outer(late, late).ravel()]
+        return np.array(rows)
 
     def force_covariance_n2(self, state: FreeModelState) -> Array:
         joint = state.observers.joint
@@ -334,8 +334,11 @@ class FreeModelEstimator:
         # The joint filter does not know what an observer of another kind adds.
         unknown = np.isnan(stds_n)
         known[unknown] = known[:, unknown] = np.nan
-        for (index, _, _), noise in zip(self._motions, state.input_noises, strict=True):
-            known = known + self._inputs[index].square_m2(state.inputs[index]) * noise
+        if self._motions:
+            squares_m2: list[float] = []
+            for item, followed in zip(self._inputs, state.inputs, strict=True):
+                squares_m2 += item.squares_m2(followed)
+            known += (np.array(squares_m2) @ state.input_errors).reshape(known.shape)
         return known
 
     def _start_of_strut(
@@ -462,7 +465,7 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
-            state.input_noises,
+            state.input_errors,
         )
         return self._estimate(after, loaded, virtual_n, oldest_ns)
 

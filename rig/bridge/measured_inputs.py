@@ -6,6 +6,7 @@ A force or torque acts as it was last measured. A body that is moved is followed
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
@@ -14,10 +15,10 @@ from msgspec.structs import replace
 from rig.bridge.measurement_age import age_limit_ns
 from rig.bridge.tracked_motion import (
     SETTLED,
-    NoiseGains,
+    ErrorGains,
     TrackedMotion,
     accelerate,
-    noise_gains,
+    error_gains,
     predict_motion,
     update_motion,
     update_with_acceleration,
@@ -63,12 +64,16 @@ class MeasuredInput(Protocol[StateT]):
         """Whether a model can start with it."""
         ...
 
-    def noise(self) -> NoiseGains | None:
-        """What the noise of its samples does to a motion that is followed; None of any other."""
+    @property
+    def gains(self) -> ErrorGains | None:
+        """The errors of a motion that is followed; None of any other input."""
         ...
 
-    def square_m2(self, state: StateT | None) -> float:
-        """Mean square of the innovations of a motion that is followed; 0 of any other."""
+    def squares_m2(self, state: StateT | None) -> tuple[float, ...]:
+        """Variance of a followed motion's samples, and mean square of what lag adds to innovations.
+
+        Empty of any other input.
+        """
         ...
 
 
@@ -97,12 +102,13 @@ class HeldInput:
     def is_ready(self, state: Sample | None) -> bool:
         return state is not None or self.channel is None
 
-    def noise(self) -> None:
+    @property
+    def gains(self) -> None:
         return None
 
-    def square_m2(self, state: Sample | None) -> float:
+    def squares_m2(self, state: Sample | None) -> tuple[()]:
         del state
-        return 0.0
+        return ()
 
 
 class Followed(Struct, frozen=True, gc=False):
@@ -110,12 +116,14 @@ class Followed(Struct, frozen=True, gc=False):
 
     Attributes:
         since_ns: Time since which it is followed without a gap.
-        square_m2: Mean square of its innovations of late, without those of the first moments.
+        innovation_m2: Mean square of its innovations of late, without those of the first moments.
+        change_m2: The same of their changes from sample to sample.
     """
 
     motion: TrackedMotion
     since_ns: int
-    square_m2: float = 0.0
+    innovation_m2: float = 0.0
+    change_m2: float = 0.0
 
     @property
     def t_ns(self) -> int:
@@ -146,23 +154,34 @@ class MovedInput:
         if state is None or sample.t_ns - state.t_ns > _LONGEST_GAP * interval_ns:
             return Followed(TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns), sample.t_ns)
         update = update_motion if self.acceleration is None else update_with_acceleration
-        motion, square_m2 = update(state.motion, sample, self.settling_s), state.square_m2
+        motion = update(state.motion, sample, self.settling_s)
+        innovation_m2, change_m2 = state.innovation_m2, state.change_m2
         if motion is not state.motion and self.is_ready(state):
-            new_m2 = motion.innovation_m * motion.innovation_m
+            new_m, before_m = motion.innovation_m, state.motion.innovation_m
             since_s = (motion.measured_ns - state.since_ns) * 1e-9 - SETTLED * self.settling_s
             share = min(1.0, interval_ns * 1e-9 / min(max(since_s, 1e-9), _FADING_S))
-            square_m2 += share * (new_m2 - square_m2)
-        return Followed(motion, state.since_ns, square_m2)
+            innovation_m2 += share * (new_m * new_m - innovation_m2)
+            change_m2 += share * ((new_m - before_m) ** 2 - change_m2)
+        return Followed(motion, state.since_ns, innovation_m2, change_m2)
 
-    def noise(self) -> NoiseGains:
-        return noise_gains(
+    @property
+    def gains(self) -> ErrorGains:
+        return self._gains
+
+    @cached_property
+    def _gains(self) -> ErrorGains:
+        return error_gains(
             self.settling_s,
             self.position.interval_ns * 1e-9,
             has_acceleration=self.acceleration is not None,
         )
 
-    def square_m2(self, state: Followed | None) -> float:
-        return 0.0 if state is None else state.square_m2
+    def squares_m2(self, state: Followed | None) -> tuple[float, float]:
+        if state is None:
+            return 0.0, 0.0
+        gains = self._gains
+        noise_m2 = state.change_m2 / gains.change
+        return noise_m2, max(state.innovation_m2 - gains.innovation * noise_m2, 0.0)
 
     def values(self, state: Followed | None, t_ns: int) -> tuple[float, float, float]:
         return (0.0, 0.0, 0.0) if state is None else predict_motion(state.motion, t_ns)

@@ -95,32 +95,45 @@ def accelerate(motion: TrackedMotion, sample: Sample) -> TrackedMotion:
     return replace(motion, acceleration_m_per_s2=sample.value)
 
 
-class NoiseGains(NamedTuple):
-    """Errors of a followed motion at the time of a sample by white noise of unit variance in these.
+class ErrorGains(NamedTuple):
+    """Errors of a followed motion at the time of a sample, by what makes them.
 
     Attributes:
-        covariance: Of position (m) and velocity (m/s), shape (2, 2).
-        innovation: Variance of the innovations.
+        noise: Covariance of position (m) and velocity (m/s) by white noise of unit variance in the
+            samples, shape (2, 2).
+        innovation: Variance of the innovations by that noise.
+        change: Variance of their changes from sample to sample by it.
+        lag: Errors of position and velocity per metre of innovation where the filter lags behind:
+            behind a constant jerk, or, with a measured acceleration, one with a constant error.
     """
 
-    covariance: NDArray[np.float64]
+    noise: NDArray[np.float64]
     innovation: float
+    change: float
+    lag: NDArray[np.float64]
 
 
-def noise_gains(settling_s: float, interval_s: float, *, has_acceleration: bool) -> NoiseGains:
-    """What white noise of samples does to a followed motion, by the response to a single one."""
+def error_gains(settling_s: float, interval_s: float, *, has_acceleration: bool) -> ErrorGains:
+    """What noise of samples and lag do to a followed motion."""
     update = update_with_acceleration if has_acceleration else update_motion
-    step_ns = round(interval_s * 1e9)
-    motion = update(TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), Sample(0, 1.0, step_ns), settling_s)
-    covariance, innovation, number = np.zeros((2, 2)), 0.0, 1
-    while True:
-        now = np.array([motion.position_m, motion.velocity_m_per_s])
-        covariance += np.outer(now, now)
-        innovation += motion.innovation_m**2
-        number += 1
-        if number * interval_s > SETTLED * 2.0 * settling_s + 3.0 * interval_s:
-            return NoiseGains(covariance, innovation)
-        motion = update(motion, Sample(0, 0.0, number * step_ns), settling_s)
+    step_ns, power = round(interval_s * 1e9), 2 if has_acceleration else 3
+    noise, innovation, change, before_m = np.zeros((2, 2)), 0.0, 0.0, 0.0
+    rest = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
+    # The response to one sample, and to a power of time.
+    passed, late = rest, rest
+    for number in range(1, 4 + math.ceil(2.0 * SETTLED * settling_s / interval_s)):
+        t_ns = number * step_ns
+        passed = update(passed, Sample(0, float(number == 1), t_ns), settling_s)
+        late = update(late, Sample(0, (t_ns * 1e-9) ** power, t_ns), settling_s)
+        now = np.array([passed.position_m, passed.velocity_m_per_s])
+        noise += np.outer(now, now)
+        innovation += passed.innovation_m**2
+        change += (passed.innovation_m - before_m) ** 2
+        before_m = passed.innovation_m
+    t_s = late.measured_ns * 1e-9
+    truth = np.array([t_s**power, power * t_s ** (power - 1)])
+    lag = np.array([late.position_m, late.velocity_m_per_s]) - truth
+    return ErrorGains(noise, innovation, change, lag / late.innovation_m)
 
 
 def lag_free_hz(settling_s: float, share: float) -> float:

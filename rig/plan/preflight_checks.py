@@ -15,7 +15,7 @@ from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.measurement_age import age_limit_ns
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
-from rig.bridge.tracked_motion import lag_free_hz, noise_gains
+from rig.bridge.tracked_motion import error_gains, lag_free_hz
 from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_interface
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
@@ -370,10 +370,10 @@ def _inputs(plan: Plan) -> list[Finding]:
 def _followed_motion(item: PlannedInput, channel: Channel) -> Finding:
     """Error that the filter of a motion adds to the height of a strut on the moved body."""
     has_acceleration = item.acceleration is not None
-    gains = noise_gains(
+    gains = error_gains(
         item.settling_s, channel.interval_ns * 1e-9, has_acceleration=has_acceleration
     )
-    gain = float(gains.covariance[0, 0]) ** 0.5
+    gain = float(gains.noise[0, 0]) ** 0.5
     text = (
         f"followed within {item.settling_s * 1e3:g} ms: heights above it gain {gain:.2g} times the "
         "noise of its position"

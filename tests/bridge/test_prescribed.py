@@ -18,8 +18,8 @@ from rig.bridge.prescribed_motion import PrescribedMotionEstimator, PrescribedMo
 from rig.bridge.tracked_motion import (
     TrackedMotion,
     accelerate,
+    error_gains,
     lag_free_hz,
-    noise_gains,
     predict_motion,
     update_motion,
     update_with_acceleration,
@@ -500,10 +500,12 @@ def test_noise_of_positions_is_passed_on_as_reported(settling_s, has_acceleratio
     for number, value in enumerate(noise.tolist(), start=1):
         motion = update(motion, Sample(0, value, number * TICK_NS), settling_s)
         passed.append([motion.position_m, motion.velocity_m_per_s, motion.innovation_m])
-    reported = noise_gains(settling_s, 1e-3, has_acceleration=has_acceleration)
+    reported = error_gains(settling_s, 1e-3, has_acceleration=has_acceleration)
     found = np.cov(np.array(passed[100:]).T)
-    assert np.allclose(found[:2, :2], reported.covariance, rtol=0.06)
+    assert np.allclose(found[:2, :2], reported.noise, rtol=0.06)
     assert found[2, 2] == pytest.approx(reported.innovation, rel=0.04)
+    changes = np.diff(np.array(passed[100:])[:, 2])
+    assert np.mean(changes**2) == pytest.approx(reported.change, rel=0.04)
 
 
 @pytest.mark.parametrize("settling_s", [0.0015, 0.004])
