@@ -50,8 +50,8 @@ class FreeModelState(Struct, frozen=True, gc=False):
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
         input_errors: Of each motion among the inputs the covariances of the laws' forces by the
-            noise of its samples and by its lag, over the mean squares of these, N²/m², in rows of
-            shape (struts * struts,).
+            noise of its samples and by its lag, one after the other, over the mean squares of these
+            as of `MeasuredInput.squares_m2`, N²/m², shape (2 * motions, struts * struts).
     """
 
     t_ns: int

@@ -66,7 +66,7 @@ class MeasuredInput(Protocol[StateT]):
 
     @property
     def gains(self) -> ErrorGains | None:
-        """The errors of a motion that is followed; None of any other input."""
+        """Gains of the errors of a motion that is followed; None of any other input."""
         ...
 
     def squares_m2(self, state: StateT | None) -> tuple[float, ...]:
@@ -118,12 +118,14 @@ class Followed(Struct, frozen=True, gc=False):
         since_ns: Time since which it is followed without a gap.
         innovation_m2: Mean square of its innovations of late, without those of the first moments.
         change_m2: The same of their changes from sample to sample.
+        averaged_s: Time over which both are averaged.
     """
 
     motion: TrackedMotion
     since_ns: int
     innovation_m2: float = 0.0
     change_m2: float = 0.0
+    averaged_s: float = 0.0
 
     @property
     def t_ns(self) -> int:
@@ -152,17 +154,25 @@ class MovedInput:
             return state and replace(state, motion=accelerate(state.motion, sample))
         interval_ns = self.position.interval_ns
         if state is None or sample.t_ns - state.t_ns > _LONGEST_GAP * interval_ns:
-            return Followed(TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns), sample.t_ns)
+            first = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
+            if state is None:
+                return Followed(first, sample.t_ns)
+            return replace(state, motion=first, since_ns=sample.t_ns)
         update = update_motion if self.acceleration is None else update_with_acceleration
         motion = update(state.motion, sample, self.settling_s)
-        innovation_m2, change_m2 = state.innovation_m2, state.change_m2
-        if motion is not state.motion and self.is_ready(state):
-            new_m, before_m = motion.innovation_m, state.motion.innovation_m
-            since_s = (motion.measured_ns - state.since_ns) * 1e-9 - SETTLED * self.settling_s
-            share = min(1.0, interval_ns * 1e-9 / min(max(since_s, 1e-9), _FADING_S))
-            innovation_m2 += share * (new_m * new_m - innovation_m2)
-            change_m2 += share * ((new_m - before_m) ** 2 - change_m2)
-        return Followed(motion, state.since_ns, innovation_m2, change_m2)
+        if motion is state.motion or not self.is_ready(state):
+            return replace(state, motion=motion)
+        new_m, before_m = motion.innovation_m, state.motion.innovation_m
+        interval_s = interval_ns * 1e-9
+        averaged_s = min(state.averaged_s + interval_s, _FADING_S)
+        share = interval_s / averaged_s
+        return Followed(
+            motion,
+            state.since_ns,
+            state.innovation_m2 + share * (new_m * new_m - state.innovation_m2),
+            state.change_m2 + share * ((new_m - before_m) ** 2 - state.change_m2),
+            averaged_s,
+        )
 
     @property
     def gains(self) -> ErrorGains:

@@ -121,7 +121,7 @@ def error_gains(settling_s: float, interval_s: float, *, has_acceleration: bool)
     rest = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
     # The response to one sample, and to a power of time.
     passed, late = rest, rest
-    for number in range(1, 4 + math.ceil(2.0 * SETTLED * settling_s / interval_s)):
+    for number in range(1, 5 + math.ceil(2.0 * SETTLED * settling_s / interval_s)):
         t_ns = number * step_ns
         passed = update(passed, Sample(0, float(number == 1), t_ns), settling_s)
         late = update(late, Sample(0, (t_ns * 1e-9) ** power, t_ns), settling_s)

@@ -13,6 +13,7 @@ from can_dbc.database import Message
 from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
+from rig.bridge.measured_inputs import MovedInput
 from rig.bridge.mode_supervisor import Supervision, Supervisor
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator, PrescribedMotionState
 from rig.bridge.tracked_motion import (
@@ -25,8 +26,8 @@ from rig.bridge.tracked_motion import (
     update_with_acceleration,
 )
 from rig.bridge.values import Mode, Request, StepInput
-from rig.channels.channel import Channel, Sample
-from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, MOTION, TEMPERATURE
 from tests.bridge.cores import bench_sample, channels
 
 MODEL = """
@@ -506,6 +507,28 @@ def test_noise_of_positions_is_passed_on_as_reported(settling_s, has_acceleratio
     assert found[2, 2] == pytest.approx(reported.innovation, rel=0.04)
     changes = np.diff(np.array(passed[100:])[:, 2])
     assert np.mean(changes**2) == pytest.approx(reported.change, rel=0.04)
+
+
+@pytest.mark.parametrize("frequency_hz", [5.0, 20.0])
+def test_noise_and_lag_of_a_motion_are_those_of_its_errors(frequency_hz):
+    noise_m, omega, rng = 5e-6, 2.0 * math.pi * frequency_hz, np.random.default_rng(4)
+    channel = Channel(0, Role.INPUT, MOTION, "road", "road", -1, TICK_NS)
+    item = MovedInput(channel, None, 0.002)
+    state, errors = None, []
+    for number in range(1, 8000):
+        t_s = number * 1e-3
+        value = 1e-3 * math.sin(omega * t_s) + noise_m * float(rng.standard_normal())
+        state = item.update(state, Sample(0, value, number * TICK_NS))
+        truth = 1e-3 * omega * math.cos(omega * t_s)
+        errors.append(item.values(state, number * TICK_NS)[1] - truth)
+    noise_m2, lag_m2 = item.squares_m2(state)
+    stated = item.gains.noise[1, 1] * noise_m2 + item.gains.lag[1] ** 2 * lag_m2
+    assert noise_m2 == pytest.approx(noise_m**2, rel=0.2)
+    assert np.mean(np.square(errors[2000:])) == pytest.approx(stated, rel=0.15)
+    # After a gap the errors are those that there were before.
+    again = item.update(state, Sample(0, 0.0, 9000 * TICK_NS))
+    assert not item.is_ready(again)
+    assert item.squares_m2(again) == (noise_m2, lag_m2)
 
 
 @pytest.mark.parametrize("settling_s", [0.0015, 0.004])

@@ -53,6 +53,41 @@ def test_a_single_sine_determines_no_delay():
     assert step.steps_s.tolist() == [0.0]
 
 
+def pair(*forces, delays):
+    """Struts of which each shows its own force, with its own delay or that of a number."""
+    made = []
+    for strut, force in enumerate(forces):
+        by_delays = np.zeros((len(force.force_n), max(delays) + 1))
+        by_delays[:, [delays[strut]]] = force.by_delays
+        shares = np.tile(np.eye(len(forces))[strut], (len(force.force_n), 1))
+        made.append(force._replace(by_delays=by_delays, shares=shares))
+    return made
+
+
+@pytest.mark.parametrize("noise_n", [0.0, 1e-7, 1e-3])
+def test_a_strut_that_is_known_better_changes_nothing_for_another(noise_n):
+    late = force_along((0.7, 1.9, 4.3), 2e-4, noise_n=1.0)
+    exact = force_along((0.7, 1.9, 4.3), 0.0, noise_n=noise_n)
+    alone, both = delay_step([late]), delay_step(pair(late, exact, delays=(0, 1)))
+    assert both.steps_s[0] == pytest.approx(alone.steps_s[0], abs=0.2 * alone.stds_s[0])
+    assert both.stds_s[0] == pytest.approx(alone.stds_s[0], rel=0.3)
+
+
+def test_delays_of_channels_that_move_alike_are_not_determined():
+    force = force_along((0.7, 1.9, 4.3), 2e-4, noise_n=1.0)
+    noise = 1e-4 * np.random.default_rng(2).standard_normal((len(force.force_n), 1))
+    alike = np.column_stack([force.by_delays, force.by_delays * (1.0 + noise)])
+    step = delay_step([force._replace(by_delays=alike)])
+    assert not np.isfinite(step.stds_s).any()
+
+
+def test_without_a_known_force_no_delay_is_determined():
+    force = force_along((0.7, 1.9, 4.3), 2e-4)
+    step = delay_step([force._replace(force_n=np.full_like(force.force_n, np.nan))])
+    assert step.steps_s.tolist() == [0.0]
+    assert not np.isfinite(step.stds_s).any()
+
+
 def test_late_columns_and_their_reader_are_exact_for_a_cubic():
     t = np.linspace(0.0, 2.0, 41)
     values = np.column_stack([t**3 - t, 2.0 * t**2])

@@ -61,6 +61,7 @@ def late(run, post, samples):
     return replace(run, inputs=run.inputs | {post: replace(item, values=held)})
 
 
+@pytest.mark.slow
 def test_a_late_post_moves_the_model_as_it_moves_dart():
     problem = build_without_delays(
         load_model(MODELS / "four_post.yaml"), [recording(1, duration_s=2.0)], 8, None

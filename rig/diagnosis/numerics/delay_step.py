@@ -7,9 +7,9 @@ delays and its covariance. Repeated until it converges this is the method of Gau
 
 A single sine determines no delay: whatever is periodic is a function of height and velocity there.
 
-Where there are more struts than coordinates, a motion shows the forces of struts only up to a part
-that is in balance with itself: in the force of one are shares of the others', whose functions are
-fitted together then.
+Where there are more struts than coordinates, a motion does not show forces of struts that are in
+balance with one another. Without these, the force of a strut contains shares of the forces of other
+struts, so that the functions of all struts are fitted together.
 
 References:
     Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973), projection of linear parameters.
@@ -46,10 +46,18 @@ micrometres to a soft seal. Without friction among the functions, its hysteresis
 delay; with only three of them, some 0.1 ms of it were."""
 
 _NO_SHARE = 1e-9
-"""Share of another strut's force that is rounding."""
+"""Products of the shares of two struts below this are rounding, over those of each with itself."""
+
+_EXACT = 1e-6
+"""Least error of a strut's force that is weighed, as a share of the largest error."""
+
+_LEAST_OWN = 1e-4
+"""Of a derivative's power that the derivatives by other delays must not be able to give: channels
+that move alike are late together. Of the posts of a car they leave 0.01."""
 
 _LEAST_SHARE = 0.03
-"""Of the derivative's power that the functions must not be able to give. Of one sine they leave
+"""Of a derivative's power, without what those by other delays give of it, that the functions must
+not be able to give. Of one sine they leave
 1e-5, with friction 0.002; of seven sines 0.3, with a stop, whose rise they can give, 0.09."""
 
 
@@ -87,20 +95,27 @@ def delay_step(struts: Sequence[ForceOverTime]) -> DelayStep:
 
     A strut whose force is not finite is left out.
     """
+    delays = struts[0].by_delays.shape[1]
+    steps, stds = np.zeros(delays), np.full(delays, np.inf)
     known = [i for i, strut in enumerate(struts) if np.all(np.isfinite(strut.force_n))]
+    if not known:
+        return DelayStep(steps, stds)
     forces = _Forces.of([struts[i]._replace(shares=struts[i].shares[:, known]) for i in known])
     left = forces.left(np.ones(len(known)))
     # Where the functions leave more, errors are larger.
-    weights = 1.0 / np.maximum(left[..., 0].std(axis=1), 1e-300)
+    errors_n = left[..., 0].std(axis=1)
+    weights = 1.0 / np.maximum(errors_n, max(_EXACT * float(errors_n.max()), 1e-300))
     left, slopes = (
         (weights[:, np.newaxis, np.newaxis] * part).reshape(-1, part.shape[2])
         for part in (forces.left(weights), forces.both[..., 1:])
     )
     residual, direction = left[:, 0], left[:, 1:]
-    delays = direction.shape[1]
-    steps, stds = np.zeros(delays), np.full(delays, np.inf)
     gram, whole = direction.T @ direction, slopes.T @ slopes
-    determined = [_own_power(gram, i) > _LEAST_SHARE * _own_power(whole, i) for i in range(delays)]
+    own = [_own_power(whole, i) for i in range(delays)]
+    determined = [
+        own[i] > _LEAST_OWN * whole[i, i] and _own_power(gram, i) > _LEAST_SHARE * own[i]
+        for i in range(delays)
+    ]
     which = np.flatnonzero(determined)
     if not len(which):
         return DelayStep(steps, stds)
@@ -109,6 +124,8 @@ def delay_step(struts: Sequence[ForceOverTime]) -> DelayStep:
     # Correlated errors: the variance of a product's sum, from its own spectrum at zero, with what
     # the fit leaves as error.
     errors = (residual + direction[:, which] @ steps[which])[:, np.newaxis] * direction[:, which]
+    # Those of different struts at a time are correlated, too.
+    errors = errors.reshape(len(known), -1, len(which)).sum(axis=0)
     covariance = inverse @ _long_run_covariance(errors) @ inverse
     stds[which] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return DelayStep(steps, stds)
@@ -131,6 +148,7 @@ class _Forces(NamedTuple):
 
     @classmethod
     def of(cls, struts: Sequence[ForceOverTime]) -> "_Forces":
+        """The forces of some struts, whose shares are those in each other."""
         return cls(
             np.array([np.column_stack([it.force_n, it.by_delays]) for it in struts]),
             [_functions(it.height_m, it.velocity_m_per_s) for it in struts],
@@ -147,7 +165,9 @@ class _Forces(NamedTuple):
         squares = weights[:, np.newaxis, np.newaxis] ** 2
         weighted = squares * self.shares
         metric = np.einsum("rki,rkj->ijk", weighted, self.shares)
-        linked = np.abs(metric).max(axis=2) > _NO_SHARE * np.abs(metric).max()
+        sizes = np.abs(metric).max(axis=2)
+        own = np.sqrt(np.diag(sizes))
+        linked = sizes > _NO_SHARE * np.outer(own, own)
         products = np.block(
             [
                 [
@@ -183,7 +203,10 @@ class _Forces(NamedTuple):
 
 
 def _solve_projection(gram: Array, against: Array) -> Array:
-    """Coefficients of least squares by products of columns, some of which may be alike."""
+    """Coefficients (k, m) of least squares by products of columns, some of which may be alike.
+
+    `gram` are the products among them, shape (k, k), and `against` those with targets, (k, m).
+    """
     norm = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / np.outer(norm, norm))
     kept = values > _RANK * values[-1]

@@ -25,7 +25,7 @@ class DrivenRun(NamedTuple):
     Attributes:
         drive: What drove it.
         fine: Input vector at half sub-steps, shape (2 * substeps * (N - 1) + 1, inputs).
-        reference: Positions of moved bodies there about which the mechanism is linear, shape (as
+        reference_m: Positions of moved bodies there about which the mechanism is linear, shape (as
             above, motions): along its table those that were measured, else zero.
         moved: What moved bodies add to heights and to their rates there, shape (as above, 2,
             struts); empty where no body is moved.
@@ -37,7 +37,7 @@ class DrivenRun(NamedTuple):
     grid: RecordingGrid
     drive: Drive
     fine: Array
-    reference: Array
+    reference_m: Array
     moved: Array
     substeps: int
     angle: float
@@ -71,7 +71,7 @@ class DrivenRun(NamedTuple):
         return self._replace(
             grid=grid,
             fine=self.fine[fine],
-            reference=self.reference[fine],
+            reference_m=self.reference_m[fine],
             moved=self.moved[fine],
             mechanism=self.mechanism.cut(nodes),
             cells=cells,
@@ -83,9 +83,9 @@ class DrivenRun(NamedTuple):
         before_s, times = (fine_times(self.grid.t_s, by * steps) for by in (1, 2))
         fine, reference = (
             np.ascontiguousarray(CubicSpline(before_s, values)(times))
-            for values in (self.fine, self.reference)
+            for values in (self.fine, self.reference_m)
         )
-        finer = self._replace(reference=reference, substeps=steps, angle=0.5 * self.angle)
+        finer = self._replace(reference_m=reference, substeps=steps, angle=0.5 * self.angle)
         return finer.driven_by(fine)
 
     def before_delays(self, delays_s: Array) -> "DrivenRun":
@@ -101,7 +101,7 @@ class DrivenRun(NamedTuple):
 
     def driven_by(self, fine: Array) -> "DrivenRun":
         """The recording with another input vector, as `fine`."""
-        moved = _moved(self.drive, self.mechanism, fine, self.reference)
+        moved = _moved(self.drive, self.mechanism, fine, self.reference_m)
         return self._replace(fine=fine, moved=moved)
 
 

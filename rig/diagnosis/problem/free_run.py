@@ -329,10 +329,10 @@ class FreeRunProblem(Problem):
         if smoothed is None:
             return None
         run, motion, spread = smoothed
-        needed = self._needed_forces(run, motion, model.parts.linear)
         m = linear_part.with_linear_changes(run.mechanism, self.linear, model.parts.linear)
-        if needed is None or m is None:
+        if m is None:
             return None
+        needed = m.strut_forces_of_motion(*motion, run.inputs, run.moved_at_nodes)
         along = track_of(motion, run)
         forces = track.strut_forces(self, model, along, self.states(k, model))
         constants = strut_constants(self, model.parts.linear)
@@ -362,11 +362,15 @@ class FreeRunProblem(Problem):
         spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
         return run, smoothed, spread
 
-    def _needed_forces(self, run: DrivenRun, motion: Trajectory, linear: Array) -> Array | None:
-        """Strut forces (N, struts) that a motion takes with changes of the linear part."""
+    def _needed_forces(self, run: DrivenRun, motion: Trajectory, linear: Array) -> Array:
+        """Strut forces (N, struts) that a motion takes with changes of the linear part.
+
+        Raises:
+            FloatingPointError: The mass is not positive.
+        """
         m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
         if m is None:
-            return None
+            raise FloatingPointError(run.grid.name)
         return m.strut_forces_of_motion(*motion, run.inputs, run.moved_at_nodes)
 
     def forces_over_time(
@@ -388,15 +392,14 @@ class FreeRunProblem(Problem):
                 ],
                 axis=-1,
             )
-        except FloatingPointError:
-            return None
-        by_masses = np.zeros((*force_n.shape, 0))
-        if masses:
-            heavier = [
-                self._needed_forces(run, motion, _changed(model.parts.linear, i, 1.0))
+            # From the same motion: no smoothing is between them.
+            by_masses = [
+                self._needed_forces(run, motion, _changed(model.parts.linear, i, 1.0)) - force_n
                 for i in masses
             ]
-            by_masses = np.stack([it - force_n for it in heavier if it is not None], axis=-1)
+        except FloatingPointError:
+            return None
+        further = np.stack(by_masses, axis=-1) if masses else np.zeros((*force_n.shape, 0))
         shares = run.mechanism.shares_seen(len(force_n))
         return [
             ForceOverTime(
@@ -404,7 +407,7 @@ class FreeRunProblem(Problem):
                 motion.velocities_m_per_s[:, i],
                 force_n[:, i],
                 by_delays[:, i] / (2.0 * step_s),
-                by_masses[:, i],
+                further[:, i],
                 shares[:, i],
             )
             for i in range(force_n.shape[1])
@@ -417,12 +420,10 @@ class FreeRunProblem(Problem):
             FloatingPointError: The model runs away.
         """
         smoothed = self._smooth_motion(k, model)
-        if smoothed is not None:
-            run, motion, _ = smoothed
-            force_n = self._needed_forces(run, motion, model.parts.linear)
-            if force_n is not None:
-                return run, motion, force_n
-        raise FloatingPointError(self.runs[k].grid.name)
+        if smoothed is None:
+            raise FloatingPointError(self.runs[k].grid.name)
+        run, motion, _ = smoothed
+        return run, motion, self._needed_forces(run, motion, model.parts.linear)
 
     def _residual_states(self, k: int, model: CandidateModel, motion: Trajectory) -> list[Smoothed]:
         """Measured less simulated motion, smoothed, before the sensors' delays."""
@@ -674,7 +675,7 @@ class FreeRunProblem(Problem):
 
 
 def _changed(values: Array, index: int, change: float) -> Array:
-    """Values of which one is changed."""
+    """Values of which that at an index is changed, shape as given."""
     changed = values.copy()
     changed[index] += change
     return changed

@@ -70,9 +70,9 @@ class LinearisedMechanism(NamedTuple):
 
     def cut(self, nodes: slice) -> "LinearisedMechanism":
         """The mechanism at some of the nodes."""
-        return (
-            self if not self.is_tabulated else LinearisedMechanism(*(part[nodes] for part in self))
-        )
+        if not self.is_tabulated:
+            return self
+        return LinearisedMechanism(*(part[nodes] for part in self))
 
     def strut_forces_of_motion(
         self, z: Array, w: Array, a: Array, inputs: Array, moved: Array
@@ -105,17 +105,18 @@ class LinearisedMechanism(NamedTuple):
         _, struts, n = self.jacobian.shape
         if struts == n:
             return forces
-        return np.einsum("kij,kj->ki", self.shares_seen(len(forces)), forces)
+        jacobian = self.jacobian[np.arange(len(forces)) if self.is_tabulated else slice(None)]
+        transposed = np.swapaxes(jacobian, 1, 2)
+        return solve_nearest(transposed, (transposed @ forces[..., np.newaxis])[..., 0])
 
     def shares_seen(self, nodes: int) -> Array:
-        """Share of each strut's force in each force without balance, (nodes, struts, struts).
+        """Share [k, i, j] of the force of a strut j in that of i without balance, at some nodes.
 
-        By force and strut. A projection: the identity with as many struts as coordinates.
+        A projection at each node: the identity with as many struts as coordinates.
         """
-        count = self.jacobian.shape[1]
-        turned = np.swapaxes(self.jacobian, 1, 2)
-        by_strut = [solve_nearest(turned, turned[..., strut]) for strut in range(count)]
-        return np.broadcast_to(np.stack(by_strut, axis=-1), (nodes, count, count))
+        count, turned = self.jacobian.shape[1], np.swapaxes(self.jacobian, 1, 2)
+        shares = self.jacobian @ np.linalg.solve(turned @ self.jacobian, turned)
+        return np.broadcast_to(shares, (nodes, count, count))
 
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import CATALOGUE, effect
+from dart_model.effects import effect
 from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.channel_delays import is_undetermined
@@ -95,8 +95,8 @@ def _without_superfluous_laws(
 ) -> ValidatedModel:
     """The model with each law removed, or replaced by a simpler one, where that loses nothing.
 
-    A law is also replaced where another formula of what it degenerates to is the better one: in the
-    shape of the last micrometres friction with pre-sliding resembles friction behind play.
+    A law is also replaced by a better one of another family, if it degenerates to a law of that:
+    friction with pre-sliding was found as friction behind play.
     """
     while True:
         laws, most = chosen.fit.candidate.new, cache(partial(_most_promising_cost, pool, chosen))
@@ -109,7 +109,9 @@ def _without_superfluous_laws(
         better = (
             other
             for law in laws
-            for other in _with_one_of(pool, chosen, law, _neighbours(law[1]), most, progress)
+            for other in _with_one_of(
+                pool, chosen, law, _neighbours(pool.problem, law), most, progress
+            )
             if pool.prefers(other, chosen)
         )
         other = next(chain(simpler, better), None)
@@ -168,11 +170,16 @@ def _with_one_of(
         yield from _converge_candidate(pool, candidate, chosen)
 
 
-def _neighbours(name: str) -> list[str]:
-    """Laws of other families to which one degenerates, but for those to which it does itself."""
+def _neighbours(problem: Problem, law: StrutEffect) -> list[str]:
+    """Other laws of the families, not its own, to which a law degenerates."""
+    strut, name = law
     own, simpler = effect(name).family, effect(name).simpler
     families = {effect(other).family for other in simpler if not effect(other).linear} - {own}
-    return [n for n, item in CATALOGUE.items() if item.family in families and n not in simpler]
+    return [
+        other
+        for at, other in candidate_laws(problem)
+        if at == strut and effect(other).family in families and other not in simpler
+    ]
 
 
 def _most_promising_cost(pool: Pool, model: ValidatedModel) -> float:
