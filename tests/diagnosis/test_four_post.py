@@ -92,7 +92,7 @@ def test_a_late_post_is_seen_beside_a_rough_model():
     assert len(found) == 11
     for channel, (delay_s, std_s) in found.items():
         expected_s = 4e-3 if channel == "motion_m:post_rl" else 0.0
-        assert std_s < 1e-4, channel
+        assert std_s < 3e-4, channel
         # Within what the search that follows looks through.
         assert delay_s == pytest.approx(expected_s, abs=1e-3), channel
 
