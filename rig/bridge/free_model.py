@@ -329,11 +329,12 @@ class FreeModelEstimator:
 
     def force_covariance_n2(self, state: FreeModelState) -> Array:
         joint = state.observers.joint
-        stds_n = np.array([strut.force_std_n for strut in state.observers.struts])
-        known = np.diag(stds_n**2) if joint is None else joint.covariance_n2.copy()
+        stds_n = [strut.force_std_n for strut in state.observers.struts]
+        known = np.diag(np.square(stds_n)) if joint is None else joint.covariance_n2.copy()
         # The joint filter does not know what an observer of another kind adds.
-        unknown = np.isnan(stds_n)
-        known[unknown] = known[:, unknown] = np.nan
+        unknown = [strut for strut, std_n in enumerate(stds_n) if math.isnan(std_n)]
+        if unknown:
+            known[unknown] = known[:, unknown] = np.nan
         if self._motions:
             squares_m2: list[float] = []
             for item, followed in zip(self._inputs, state.inputs, strict=True):
@@ -534,7 +535,7 @@ class FreeModelEstimator:
         t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
         stds_n = [observer.force_std_n for observer in state.observers.struts]
         if self._motions:
-            stds_n = np.sqrt(np.diagonal(self.force_covariance_n2(state))).tolist()
+            stds_n = np.sqrt(self.force_covariance_n2(state).diagonal()).tolist()
         for strut, observer in enumerate(state.observers.struts):
             if (
                 observer.is_disturbed
