@@ -23,7 +23,7 @@ from rig.run.loop import Progress, RunControl
 from rig.simulated_bench.config import load_bench_config
 from tests.slow_reference import write_slow_bridge, write_slow_dbc
 
-TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
+TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend", "j1939acd")
 
 BENCH_IDS = ("100", "200")
 

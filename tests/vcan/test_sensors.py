@@ -3,7 +3,6 @@ kernel's own and can-utils."""
 
 import errno
 import json
-import shutil
 import socket
 import threading
 import time
@@ -98,7 +97,6 @@ def sending(channel: str) -> Iterator[None]:
             thread.join()
 
 
-@pytest.mark.skipif(shutil.which("j1939acd") is None, reason="j1939acd of can-utils is missing")
 def test_a_level_sensor_of_the_kernels_j1939(second_vcan, tmp_path):
     claims = [
         "j1939acd",

@@ -157,18 +157,38 @@ class _Forces(NamedTuple):
         )
 
     def left(self, weights: Array) -> Array:
-        """What functions and further signals leave of the forces, weighted by strut, as `both`.
+        """What functions and further signals leave of the forces, weighted by strut, as `both`."""
+        squares = weights[:, np.newaxis, np.newaxis] ** 2
+        weighted = squares * self.shares
+        targets = np.concatenate([self.further, self.both], axis=2)
+        with_targets = np.vstack(
+            [
+                rows.T @ np.einsum("rk,rkm->km", weighted[..., i], targets)
+                for i, rows in enumerate(self.functions)
+            ]
+        )
+        signals = self.further.shape[2]
+        among = np.einsum("rkm,rkn->mn", squares * self.further, targets)
+        shared = with_targets[:, :signals]
+        gram = np.block([[self._products(weighted), shared], [shared.T, among[:, :signals]]])
+        against = np.vstack([with_targets[:, signals:], among[:, signals:]])
+        coefficients = _solve_projection(gram, against)
+        ends = np.cumsum([rows.shape[1] for rows in self.functions])
+        *own, rest = np.split(coefficients, ends)
+        given = np.array([rows @ part for rows, part in zip(self.functions, own, strict=True)])
+        return self.both - np.einsum("rks,skm->rkm", self.shares, given) - self.further @ rest
+
+    def _products(self, weighted: Array) -> Array:
+        """Products among the functions of all struts; `weighted`: shares times squared weights.
 
         With the matrix P of shares at a time and weights W, the functions F of a strut i are
         P[:, i] F in all forces: the product of two of them is F times (PᵀW²P)[i, j] times F.
         """
-        squares = weights[:, np.newaxis, np.newaxis] ** 2
-        weighted = squares * self.shares
         metric = np.einsum("rki,rkj->ijk", weighted, self.shares)
         sizes = np.abs(metric).max(axis=2)
         own = np.sqrt(np.diag(sizes))
         linked = sizes > _NO_SHARE * np.outer(own, own)
-        products = np.block(
+        return np.block(
             [
                 [
                     a.T @ (metric[i, j, :, np.newaxis] * b)
@@ -179,27 +199,6 @@ class _Forces(NamedTuple):
                 for i, a in enumerate(self.functions)
             ]
         )
-        targets = np.concatenate([self.further, self.both], axis=2)
-        with_targets = np.vstack(
-            [
-                a.T @ np.einsum("rk,rkm->km", weighted[..., i], targets)
-                for i, a in enumerate(self.functions)
-            ]
-        )
-        signals = self.further.shape[2]
-        among = np.einsum("rkm,rkn->mn", squares * self.further, targets)
-        gram = np.block(
-            [
-                [products, with_targets[:, :signals]],
-                [with_targets[:, :signals].T, among[:, :signals]],
-            ]
-        )
-        against = np.vstack([with_targets[:, signals:], among[:, signals:]])
-        coefficients = _solve_projection(gram, against)
-        ends = np.cumsum([rows.shape[1] for rows in self.functions])
-        *own, rest = np.split(coefficients, ends)
-        given = np.array([rows @ part for rows, part in zip(self.functions, own, strict=True)])
-        return self.both - np.einsum("rks,skm->rkm", self.shares, given) - self.further @ rest
 
 
 def _solve_projection(gram: Array, against: Array) -> Array:

@@ -377,25 +377,22 @@ class FreeRunProblem(Problem):
         self, k: int, model: CandidateModel, delays: Sequence[int]
     ) -> Sequence[ForceOverTime] | None:
         """The force that the smoothed motion takes in each strut, balanced forces left out."""
-        step_s = max(_FORCE_STEP_S, self.runs[k].grid.step_s)
+        linear, step_s = model.parts.linear, max(_FORCE_STEP_S, self.runs[k].grid.step_s)
         masses = [i for i, p in enumerate(self.linear) if p.kind == "mass"]
+
+        def differentiate(delay: int) -> Array:
+            later_n, earlier_n = (
+                self._smooth_forces(k, model.with_linear(_changed(linear, delay, change_s)))[2]
+                for change_s in (step_s, -step_s)
+            )
+            return (later_n - earlier_n) / (2.0 * step_s)
+
         try:
             run, motion, force_n = self._smooth_forces(k, model)
-            by_delays = np.stack(
-                [
-                    self._smooth_forces(k, model.with_linear(later))[2]
-                    - self._smooth_forces(k, model.with_linear(earlier))[2]
-                    for later, earlier in (
-                        [_changed(model.parts.linear, i, sign * step_s) for sign in (1.0, -1.0)]
-                        for i in delays
-                    )
-                ],
-                axis=-1,
-            )
+            by_delays = np.stack([differentiate(delay) for delay in delays], axis=-1)
             # From the same motion: no smoothing is between them.
             by_masses = [
-                self._needed_forces(run, motion, _changed(model.parts.linear, i, 1.0)) - force_n
-                for i in masses
+                self._needed_forces(run, motion, _changed(linear, i, 1.0)) - force_n for i in masses
             ]
         except FloatingPointError:
             return None
@@ -406,7 +403,7 @@ class FreeRunProblem(Problem):
                 motion.heights_m[:, i],
                 motion.velocities_m_per_s[:, i],
                 force_n[:, i],
-                by_delays[:, i] / (2.0 * step_s),
+                by_delays[:, i],
                 further[:, i],
                 shares[:, i],
             )
@@ -476,9 +473,7 @@ class FreeRunProblem(Problem):
         for index, parameter in enumerate(self.linear):
             if parameter.kind != "delay" or parameter.input < 0:
                 continue
-            linear = model.parts.linear.copy()
-            linear[index] += _DELAY_STEP_S
-            later = model.with_linear(linear)
+            later = model.with_linear(_changed(model.parts.linear, index, _DELAY_STEP_S))
             moved = self.simulate(self._before_delays(k, later), later, later.parts.starts[k])
             if moved is None:
                 raise FloatingPointError(self.runs[k].grid.name)

@@ -269,13 +269,12 @@ class PrescribedProblem(Problem):
         """What the load cells show along the motion that they show."""
         run, along = self.runs[k], self.runs[k].seen(self._delays_s(model))
         forces: list[ForceOverTime] = []
-        shares = np.broadcast_to(
-            np.eye(len(self.noise_n)), (len(along.t_s), *2 * (len(self.noise_n),))
-        )
-        for i in range(len(self.noise_n)):
+        nodes, struts = len(along.t_s), len(self.noise_n)
+        shares = np.broadcast_to(np.eye(struts), (nodes, struts, struts))
+        for i in range(struts):
             own = [float(self.linear[delay].strut == i) for delay in delays]
             by_delays = run.cell_rates_n_per_s[i, :, np.newaxis] * own
-            nothing = np.zeros((len(along.t_s), 0))
+            nothing = np.zeros((nodes, 0))
             z, w = along.heights_m[i], along.velocities_m_per_s[i]
             forces.append(ForceOverTime(z, w, run.cells_n[i], by_delays, nothing, shares[:, i]))
         return forces
