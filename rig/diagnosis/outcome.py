@@ -57,7 +57,8 @@ class ChannelCorrection:
     Attributes:
         channel: Column of the recordings, as ``height_m:strut``.
         parameter: ``delay_s``: by how much later the channel shows what is true than the first
-            input of a driven bench, or than the height where the motion is prescribed.
+            input of a driven bench, or than the height where the motion is prescribed. ``gain``:
+            how many times the motion of a height it shows, against a measured motion of the base.
         nominal: What the recordings were corrected by already.
         total: Its value by the data.
     """
@@ -68,8 +69,8 @@ class ChannelCorrection:
     total: Estimate
 
     @property
-    def is_late(self) -> bool:
-        """Whether it is later, or earlier, than it was taken for."""
+    def is_wrong(self) -> bool:
+        """Whether its value is another one than it was taken for."""
         low, high = self.total.low, self.total.high
         return low is not None and high is not None and not low <= self.nominal <= high
 

@@ -189,7 +189,7 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
     """The linear parameters that a fit left free, with their intervals."""
     corrections: list[LinearCorrection] = []
     for variable, p in enumerate(_free(problem, estimates.fit)):
-        if p.kind == "delay":
+        if p.channel:
             continue
         nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
         about = p.kind in ("stiffness", "preload")
@@ -208,15 +208,17 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
 def channel_corrections(
     problem: Problem, estimates: FitEstimates, *, is_explained: bool
 ) -> tuple[ChannelCorrection, ...]:
-    """The delays that a fit left free, with their intervals.
+    """The delays and gains that a fit left free, with their intervals.
 
     A delay at the end of its range is not what the data determine. Where no model explains the
-    data, only one counts that they show without a model: another imitates what is missing.
+    data, only one counts that they show without a model: another imitates what is missing. Gains
+    are only free where without them much more is left.
     """
     least_s = _OF_SAMPLING * max(grid.step_s for grid in problem.grids)
     space, corrections = estimates.fit.space, list[ChannelCorrection]()
     for i, p in enumerate(_free(problem, estimates.fit)):
-        if p.kind != "delay" or is_undetermined(p) or not (is_explained or p.expected):
+        is_gain = p.kind == "height_gain"
+        if not p.channel or is_undetermined(p) or not (is_explained or p.expected or is_gain):
             continue
         found = estimates.estimate(i, p.nominal)
         value = found.value - p.nominal
@@ -224,7 +226,8 @@ def channel_corrections(
         if found.low is None or found.high is None or is_at_end:
             found = Estimate(found.value, None, None)
         else:
-            halves = [math.hypot(end - found.value, least_s) for end in (found.low, found.high)]
+            least = 0.0 if is_gain else least_s
+            halves = [math.hypot(end - found.value, least) for end in (found.low, found.high)]
             found = Estimate(found.value, found.value - halves[0], found.value + halves[1])
         corrections.append(ChannelCorrection(p.channel, PARAMETERS[p.kind], p.nominal, found))
     cells = problem.delays_of_cells(estimates.fit.model) if is_explained else {}
@@ -303,13 +306,13 @@ def _linear_effects(
 ) -> tuple[FoundEffect, ...]:
     """Delays as effects, and where nothing else was found, all linear corrections."""
     result = estimates.fit
-    late = {item.channel for item in channels if item.is_late}
+    late = {(item.channel, item.parameter) for item in channels if item.is_wrong}
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)
     implied = _find_preload_of_springs(problem, estimates)
     for variable, (index, p) in enumerate(zip(indices, _free(problem, result), strict=True)):
-        if p.kind == "delay":
-            is_effect = p.channel in late
+        if p.channel:
+            is_effect = (p.channel, PARAMETERS[p.kind]) in late
         else:
             is_alone = not (result.candidate.new or late)
             is_effect = is_alone and p.kind in EFFECTS and variable not in implied
@@ -536,7 +539,14 @@ def _notes_of_channels(channels: Sequence[ChannelCorrection]) -> tuple[str, ...]
     """What to do about a late channel."""
     notes: list[str] = []
     for item in channels:
-        if not item.is_late:
+        if not item.is_wrong:
+            continue
+        if item.parameter == PARAMETERS["height_gain"]:
+            notes.append(
+                f"{item.channel} shows {item.total.value:.4g} times the motion that is consistent "
+                "with the measured motion of the base and with the other heights: correct its "
+                "scaling (in the DBC or the mapping). The corrected model does not contain it."
+            )
             continue
         if item.total.value > 0.0:
             what = f"state `delay_s: {item.total.value:.3g}` for it"

@@ -1,11 +1,16 @@
 """Benches whose base is moved as measured: a quarter car on a road, by the simulated bench."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dart_model.spec import MODELS, load_model
-from rig.channels.measured_quantities import MOTION
+from rig.channels.measured_quantities import APPLIED_FORCE, MOTION
 from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
+from rig.diagnosis.search.fit import fit
 from rig.plan.config import CONFIGS
 from rig.recordings.csv_file import read_csv
 from rig.recordings.recording import RecordedInput, Recording, RecordingError
@@ -102,3 +107,57 @@ def test_inputs_of_a_csv_are_those_of_the_model(tmp_path):
         check_fits(other, rough())
     with pytest.raises(RecordingError, match="expected a column applied_force_n, because model"):
         check_fits(other, load_model(MODELS / "quarter_car.yaml"))
+
+
+def with_gain(run, strut, gain):
+    """A recording whose height of a strut, by index, shows too much or too little."""
+    heights_m = run.heights_m.copy()
+    own = heights_m[:, strut]
+    heights_m[:, strut] = own.mean() + gain * (own - own.mean())
+    return replace(run, heights_m=heights_m)
+
+
+def test_heights_are_read_with_a_gain_about_mid_stroke():
+    """The residual of a right model is noise with the gain that was there."""
+    run = with_gain(recording(1), 1, 1.03)
+    learnt = build_without_delays(rough(), [run], 8, None)
+    problem = replace(learnt, linear=(*learnt.linear, *learnt.height_gains))
+    assert [p.channel for p in problem.height_gains] == ["height_m:tyre", "height_m:suspension"]
+    first = nominal_model(problem, first_starts(problem, nominal(problem)))
+    nothing_free = fit(problem, first, np.zeros(len(problem.linear), dtype=np.bool_))
+
+    def mean_square(gain):
+        linear = first.parts.linear.copy()
+        linear[-1] = gain - 1.0
+        # The zero of the sensor is not known: what its gain is about is a preload.
+        free = np.array([p.kind == "preload" for p in problem.linear])
+        return fit(problem, nothing_free.model.with_linear(linear), free).mean_square
+
+    assert mean_square(1.03) < 1.3
+    assert mean_square(1.0) > 30.0 * mean_square(1.03)
+
+
+def test_no_gain_is_corrected_where_a_force_sets_the_scale():
+    heights, t_s = recording(1).heights_m, recording(1).t_s
+    drive = RecordedInput(APPLIED_FORCE, 50.0 * np.sin(7.0 * t_s))
+    spec = load_model(MODELS / "quarter_car.yaml")
+    run = Recording("driven", t_s, heights, {"applied_force": drive})
+    assert build_without_delays(spec, [run], 8, None).height_gains == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("strut", "gain"), [(0, 0.975), (1, 1.02)])
+def test_a_height_with_a_wrong_gain_is_found_beside_friction(strut, gain):
+    friction = UndeclaredEffect(
+        name="friction", strut="suspension", parameters={"coulomb_force_n": 60.0}
+    )
+    runs = [with_gain(recording(seed, friction), strut, gain) for seed in (1, 2)]
+    found = diagnose(rough(mass=1.05, stiffness=0.9, damping=1.2), runs[:1], runs[1:]).diagnosis
+    assert found.verdict == "explained"
+    shown = {item.channel: item.total for item in found.channels if item.parameter == "gain"}
+    total = shown[f"height_m:{('tyre', 'suspension')[strut]}"]
+    assert total.value == pytest.approx(gain, abs=5e-4)
+    assert total.low < gain < total.high
+    families = {item.family for item in found.effects} - {"input_gain"}
+    assert families == {"friction"}
+    assert any("correct its scaling" in note for note in found.notes)

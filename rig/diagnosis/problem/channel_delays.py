@@ -29,6 +29,9 @@ LONGEST_S = 0.1
 """Longest delay, either way, that is searched for."""
 SIGNIFICANT = 4.0
 """Standard deviations from which on an estimate counts before a search, or without one."""
+GAIN_STD, MOST_GAIN = 0.02, 0.2
+"""Standard deviation of the prior on a height's gain, and its largest change: displacement sensors
+are calibrated to a percent or better, and wired with a wrong range now and then."""
 UNKNOWN_S = 0.01
 """Longest delay that is considered where the data do not show it: a fit of an unknown one would
 only replace damping."""
@@ -62,6 +65,25 @@ def delay_parameters(spec: ModelSpec, recording: Recording) -> tuple[LinearParam
         if index:
             delays.append(_parameter(recording, 0, index, f"{item.quantity.column}:{name}"))
     return tuple(delays)
+
+
+def height_gains(spec: ModelSpec) -> tuple[LinearParameter, ...]:
+    """Gains of the heights of a bench whose base is moved as measured, against this motion.
+
+    A gain of all channels together cannot be seen: it changes what is not linear in the struts.
+    """
+    return tuple(
+        LinearParameter(
+            index,
+            "height_gain",
+            1.0,
+            GAIN_STD,
+            -MOST_GAIN,
+            channel=f"{HEIGHT.column}:{strut.name}",
+            most=MOST_GAIN,
+        )
+        for index, strut in enumerate(spec.struts)
+    )
 
 
 def is_undetermined(parameter: LinearParameter) -> bool:

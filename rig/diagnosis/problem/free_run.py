@@ -29,6 +29,7 @@ from rig.diagnosis.problem.channel_delays import (
     Delays,
     LateReader,
     delays_of,
+    height_gains,
     known_share,
     late_columns,
 )
@@ -50,12 +51,14 @@ from rig.diagnosis.problem.problem import (
     ComparedModels,
     Flags,
     Integers,
+    LinearParameter,
     Problem,
     ProblemBasis,
     ResidualForces,
     RunEvaluation,
     Segment,
     first_starts,
+    mid_stroke_m,
     nominal,
     nominal_model,
     rms,
@@ -141,6 +144,11 @@ class FreeRunProblem(Problem):
         return upper if upper != WORLD else lower
 
     @property
+    def height_gains(self) -> tuple[LinearParameter, ...]:
+        drive = self.runs[0].drive
+        return height_gains(self.spec) if drive.moved and not drive.has_force else ()
+
+    @property
     def grids(self) -> tuple[RecordingGrid, ...]:
         return tuple(run.grid for run in self.runs)
 
@@ -186,16 +194,40 @@ class FreeRunProblem(Problem):
             np.concatenate([np.ones(2 * n, dtype=np.bool_), fitted]),
         )
 
-    # --- delays -----------------------------------------------------------------------------------
+    # --- channels ---------------------------------------------------------------------------------
 
     def _delays(self, model: CandidateModel) -> Delays:
         inputs = len(self.runs[0].drive.inputs)
         return delays_of(self.linear, model.parts.linear, len(self.noise_m), inputs)
 
+    def _gains(self, model: CandidateModel) -> Array:
+        """Gain of each strut's measured height, shape (struts,)."""
+        gains = np.ones(len(self.noise_m))
+        for parameter, change in zip(self.linear, model.parts.linear, strict=True):
+            if parameter.kind == "height_gain":
+                gains[parameter.strut] += change
+        return gains
+
     def _seen(self, k: int, model: CandidateModel, motion: Trajectory) -> Array:
-        """Heights of a simulated motion as delayed sensors show them, shape (N, struts)."""
-        t_s, delays_s = self.runs[k].grid.t_s, self._delays(model).struts
-        return late_columns(t_s, motion.heights_m, motion.velocities_m_per_s, delays_s)
+        """Heights of a simulated motion as the sensors show them, shape (N, struts)."""
+        return self._as_read(k, model, motion.heights_m, motion.velocities_m_per_s)
+
+    def _as_read(
+        self, k: int, model: CandidateModel, heights_m: Array, rates: Array | None
+    ) -> Array:
+        """Heights (N, struts) by sensors with their delays, and with their gains about mid-stroke.
+
+        `rates` are those of the heights, where they are known.
+        """
+        delays_s, gains = self._delays(model).struts, self._gains(model)
+        late = late_columns(self.runs[k].grid.t_s, heights_m, rates, delays_s)
+        if np.all(gains == 1.0):
+            return late
+        return self._middles_m + gains * (late - self._middles_m)
+
+    @cached_property
+    def _middles_m(self) -> Array:
+        return np.array([mid_stroke_m(motion) for motion in self.motions])
 
     def _before_delays(self, k: int, model: CandidateModel) -> DrivenRun:
         """A recording with its inputs as they were before their delays."""
@@ -423,14 +455,15 @@ class FreeRunProblem(Problem):
         return run, motion, self._needed_forces(run, motion, model.parts.linear)
 
     def _residual_states(self, k: int, model: CandidateModel, motion: Trajectory) -> list[Smoothed]:
-        """Measured less simulated motion, smoothed, before the sensors' delays."""
+        """Measured less simulated motion, smoothed, before the sensors' delays and gains."""
         grid, delays_s = self.runs[k].grid, self._delays(model).struts
         states, _ = grid.residual_states(self._seen(k, model, motion))
+        channels = zip(states, delays_s.tolist(), self._gains(model).tolist(), strict=True)
         return [
             item._replace(
-                states=late_columns(grid.t_s, item.states, None, np.full(_ORDER, -delay_s))
+                states=late_columns(grid.t_s, item.states, None, np.full(_ORDER, -delay_s)) / gain
             )
-            for item, delay_s in zip(states, delays_s.tolist(), strict=True)
+            for item, delay_s, gain in channels
         ]
 
     # --- the regression along the motion ----------------------------------------------------------
@@ -491,7 +524,7 @@ class FreeRunProblem(Problem):
         cut: slice,
         model: CandidateModel,
     ) -> Segment:
-        linear, delays_s = model.parts.linear, self._delays(model).struts
+        linear, delays_s, gains = model.parts.linear, self._delays(model).struts, self._gains(model)
         m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
         if m is None:
             raise FloatingPointError(run.grid.name)
@@ -514,8 +547,8 @@ class FreeRunProblem(Problem):
         weight = known_share(grid.t_s, delays_s)[cut][rows] / self.noise_m
 
         def whiten(heights_m: Array) -> Array:
-            """Heights (N, struts) as they are seen, whitened, shape (m,)."""
-            return (read(heights_m) * weight).ravel()
+            """Changes (N, struts) of heights as they are seen, whitened, shape (m,)."""
+            return (read(heights_m) * gains * weight).ravel()
 
         def whiten_heights(forces: Array) -> Array:
             """Whitened heights (m,) under generalised forces (N, n)."""
@@ -531,7 +564,11 @@ class FreeRunProblem(Problem):
         target = (raw[rows] * weight).ravel() - whiten_heights(held)
         columns: list[Array] = []
         for index, parameter in enumerate(self.linear):
-            if parameter.kind != "delay":
+            if parameter.kind == "height_gain":
+                own = np.zeros_like(seen[0][cut][rows])
+                own[:, parameter.strut] = (seen[0][cut][rows] - self._middles_m)[:, parameter.strut]
+                columns.append((own / gains * weight).ravel())
+            elif parameter.kind != "delay":
                 force = mechanism.unit_force(parameter, along, acceleration, self.motions)
                 columns.append(whiten_heights(force))
             elif index in seen[1]:
@@ -600,8 +637,7 @@ class FreeRunProblem(Problem):
             found_m = on_dart.dart_heights(
                 self, self._before_delays(k, model), model, start, expected_m, tolerance_m
             )
-            delays_s = self._delays(model).struts
-            on_dart_m.append(late_columns(grid.t_s, found_m, None, delays_s))
+            on_dart_m.append(self._as_read(k, model, found_m, None))
         forces = [self.residual_forces(k, model) for model in models]
         residual_n = [
             np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces

@@ -40,6 +40,7 @@ PARAMETERS = {
     "gain": "input_gain",
     "free_length": "free_length_m",
     "delay": "delay_s",
+    "height_gain": "gain",
 }
 """Kinds as they are called in a diagnosis and in a model's `tolerance`."""
 EFFECTS = {
@@ -49,6 +50,7 @@ EFFECTS = {
     "preload": "preload",
     "gain": "input_gain",
     "delay": "delay",
+    "height_gain": "input_gain",
 }
 """Effects that stand for a change of each."""
 
@@ -181,8 +183,8 @@ def spec_with_linear_changes(
                 spec = _with_preload(spec, strut.name, change)
             case "mass":
                 spec = _with_mass(spec, strut.name, change)
-            case "delay":
-                continue  # One of the measurement.
+            case "delay" | "height_gain":
+                continue  # Of the measurement.
             case "free_length":
                 spec = _with_field(spec, strut.name, "free_length_m", change)
                 spec = _with_preload(spec, strut.name, -strut.stiffness_n_per_m * change)

@@ -33,7 +33,9 @@ Flags = NDArray[np.bool_]
 StrutEffect = tuple[int, str]
 """Index of a strut, and the name of an effect in it."""
 
-Kind = Literal["mass", "stiffness", "damping", "preload", "gain", "free_length", "delay"]
+Kind = Literal[
+    "mass", "stiffness", "damping", "preload", "gain", "free_length", "delay", "height_gain"
+]
 
 
 class LinearParameter(NamedTuple):
@@ -46,7 +48,7 @@ class LinearParameter(NamedTuple):
         least: Lowest change; mass stays positive, no spring or damper turns negative.
         input: Of a gain, the index in the input vector of what it is the gain of; of an input's
             delay, its index among the inputs.
-        channel: Of a delay, the channel that is late.
+        channel: Of a delay, the channel that is late; of a height's gain, that height.
         most: Highest change.
         expected: Mean of the prior on the change.
     """
@@ -223,6 +225,11 @@ class Problem(ABC):
     def is_driven_by_force(self) -> bool:
         """Whether the scale of what drives the bench is that of its forces and masses."""
         return False
+
+    @property
+    def height_gains(self) -> tuple[LinearParameter, ...]:
+        """Gains of heights that the recordings may determine; none of them is free as yet."""
+        return ()
 
     @property
     @abstractmethod

@@ -439,7 +439,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
             changes[i], free[i] = 1.0 / (1.0 + share) - 1.0, True
         elif i in alike:
             changes[i], free[i] = 0.0, False
-        elif p.kind not in ("free_length", "delay"):
+        elif p.kind not in ("free_length", "delay", "height_gain"):
             whole = p.nominal if i in scaled else 0.0
             changes[i] = (whole + changes[i]) / (1.0 + share) - whole
             free[i] |= p.kind == "preload"

@@ -24,11 +24,11 @@ from rig.pages.number_formats import (
 )
 from rig.pages.report.words import (
     LINEAR,
+    describe_channel,
     is_prescribed,
     join_words,
-    late_channels,
-    lateness,
     missing,
+    wrong_channels,
 )
 
 _NOT_USED = "on data not used for fitting"
@@ -142,7 +142,10 @@ def _headline(diagnosis: Diagnosis) -> str:
         return f"{capital(join_words(names, 'and'))}{also} missing"
     parts = [_direction(item) for item in diagnosis.linear]
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
-    parts += [f"{item.channel} late" for item in late_channels(diagnosis)]
+    parts += [
+        f"{item.channel} {'late' if item.parameter == 'delay_s' else 'with a wrong gain'}"
+        for item in wrong_channels(diagnosis)
+    ]
     more = "more is missing" if diagnosis.verdict == "partly_explained" else "no further effect"
     return f"{capital(join_words(parts, 'and') or 'parameters off')}; {more}"
 
@@ -176,7 +179,7 @@ def _values(diagnosis: Diagnosis) -> tuple[str, ...]:
     for item in diagnosis.linear:
         value, interval = value_and_interval(item.total, LINEAR[item.parameter][1])
         texts.append(f"{_direction(item)}: {value} (95 %: {interval})")
-    texts += [lateness(item) for item in late_channels(diagnosis)]
+    texts += [describe_channel(item) for item in wrong_channels(diagnosis)]
     return tuple(texts)
 
 

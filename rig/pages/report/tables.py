@@ -115,11 +115,14 @@ def linear(diagnosis: Diagnosis) -> tuple[Row, ...]:
 
 def channels(diagnosis: Diagnosis) -> tuple[Row, ...]:
     """Channel, key, nominal, value and interval of each correction of the measurement."""
-    return tuple((item.channel, item.parameter, *_delay(item)) for item in diagnosis.channels)
+    return tuple(
+        (item.channel, item.parameter, *_channel_values(item)) for item in diagnosis.channels
+    )
 
 
-def _delay(item: ChannelCorrection) -> tuple[str, str, str]:
-    return quantity(item.nominal, "s"), *value_and_interval(item.total, "s")
+def _channel_values(item: ChannelCorrection) -> tuple[str, str, str]:
+    unit = "s" if item.parameter == "delay_s" else ""
+    return quantity(item.nominal, unit), *value_and_interval(item.total, unit)
 
 
 def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:

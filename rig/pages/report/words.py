@@ -49,20 +49,24 @@ def join_words(items: Sequence[str], last: str) -> str:
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
 
 
+_OF_CHANNELS = {"delay_s": "delay", "gain": "input_gain"}
+"""Effects that stand for corrections of channels."""
+
+
 def missing(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
     """Missing effects, without those that are also corrections of linear part or channels."""
     linear = {(item.strut, item.parameter) for item in diagnosis.linear}
+    of_channels = {_OF_CHANNELS[item.parameter] for item in diagnosis.channels}
     return tuple(
         item
         for item in diagnosis.effects
-        if (item.strut, _AS_EFFECT.get(item.name)) not in linear
-        and not (item.family == "delay" and diagnosis.channels)
+        if (item.strut, _AS_EFFECT.get(item.name)) not in linear and item.name not in of_channels
     )
 
 
-def late_channels(diagnosis: Diagnosis) -> tuple[ChannelCorrection, ...]:
-    """Channels that the data show to be late or early."""
-    return tuple(item for item in diagnosis.channels if item.is_late)
+def wrong_channels(diagnosis: Diagnosis) -> tuple[ChannelCorrection, ...]:
+    """Channels that the data show to be late or early, or to have a wrong gain."""
+    return tuple(item for item in diagnosis.channels if item.is_wrong)
 
 
 def reference_channel(diagnosis: Diagnosis) -> str:
@@ -70,11 +74,15 @@ def reference_channel(diagnosis: Diagnosis) -> str:
     return "the height" if is_prescribed(diagnosis) else "the bench's first input"
 
 
-def lateness(item: ChannelCorrection) -> str:
+def describe_channel(item: ChannelCorrection) -> str:
     """Channel and delay as “strut_force_n:strut is 3.10 ms late (95 %: 3.05 to 3.15 ms)”.
 
-    A recording that a delay was taken from already has the rest alone.
+    A recording that a delay was taken from already has the rest alone. A gain is shown as
+    “height_m:strut shows 1.020 times the motion (95 %: 1.019 to 1.021)”.
     """
+    if item.parameter == "gain":
+        value, interval = value_and_interval(item.total, "")
+        return f"{item.channel} shows {value} times the motion (95 %: {interval})"
     ends = [item.total.value, item.total.low, item.total.high]
     sizes = [abs(end - item.nominal) for end in ends if end is not None]
     value, interval = value_and_interval(Estimate(sizes[0], min(sizes), max(sizes)), "s")
@@ -155,7 +163,7 @@ def _finding(diagnosis: Diagnosis, struts: int) -> str:
 
 
 def _channels_clause(diagnosis: Diagnosis) -> str:
-    return "".join(f"; {lateness(item)}" for item in late_channels(diagnosis))
+    return "".join(f"; {describe_channel(item)}" for item in wrong_channels(diagnosis))
 
 
 def _corrections_clause(diagnosis: Diagnosis, struts: int) -> str:
@@ -229,7 +237,7 @@ def _against_floor(value: float, floor: float, unit: str) -> str:
 
 def _error_falls(diagnosis: Diagnosis, subject: str = "") -> str:
     name, falls, _, change = _error(diagnosis)
-    corrections = len(diagnosis.linear) + len(diagnosis.existing) + len(late_channels(diagnosis))
+    corrections = len(diagnosis.linear) + len(diagnosis.existing) + len(wrong_channels(diagnosis))
     single = len(missing(diagnosis)) + corrections == 1
     if corrections:
         plain = "this correction" if single else "these corrections"
