@@ -23,6 +23,7 @@ from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.settling import settling_times_ns
 from rig.observers.protocol import AnyObserver
 from rig.plan.plan import Plan, PlannedInput
+from rig.plan.virtual_sensors import make_reader
 
 ENGINES: Mapping[str, Callable[[ModelSpec], AnyPlant]] = MappingProxyType({"dart": DartPlant})
 """`engine` in a configuration -> what makes a plant of a model. A further one is a line here."""
@@ -56,8 +57,7 @@ def _virtual_sensors(plan: Plan, estimator: AnyEstimator) -> VirtualSensors | No
     sensors = plan.virtual_sensors
     if not sensors:
         return None
-    of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
-    reader = estimator.read_model(of_model) if of_model else None
+    reader = make_reader(estimator.read_model, sensors, plan.source)
     return VirtualSensors([item.place for item in sensors], reader)
 
 

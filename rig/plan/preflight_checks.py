@@ -31,6 +31,7 @@ from rig.closed_loop.strut_response import (
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, PlannedInput, vital_channels
+from rig.plan.virtual_sensors import make_reader
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
@@ -126,11 +127,11 @@ def _virtual_sensors(plan: Plan, plant: AnyPlant) -> list[Finding]:
     """Which virtual sensors the measured heights correct."""
     measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
     observed = [i for i in measured if plan.struts[i].observer.estimates_force]
-    of_model = {it.name: it.sensor for it in plan.virtual_sensors if it.strut < 0}
+    of_model = [it.name for it in plan.virtual_sensors if it.strut < 0]
+    reader = make_reader(plant.virtual_sensors, plan.virtual_sensors, plan.source)
     corrected: dict[str, bool] = {}
-    if of_model:
+    if reader is not None:
         rest_m = [strut.free_length_m for strut in plan.struts]
-        reader = plant.virtual_sensors(of_model)
         found = find_corrected(plant, reader, rest_m, measured, observed)
         corrected = dict(zip(of_model, found, strict=True))
     findings: list[Finding] = []

@@ -1,11 +1,13 @@
 """Virtual sensors of a plan: what each reads, its column in the log, and its signal on the bus."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from can_dbc.errors import InputError, expected_name
+from dart_model.errors import ModelError
 from dart_model.plant.virtual_sensors import turning_joints
+from dart_model.protocol import AnySensorReader
 from dart_model.spec import ModelSpec
 from dart_model.virtual_sensors import KINDS, SensedQuantity, VirtualSensor
 from rig.bridge.counts import Report
@@ -81,6 +83,23 @@ def resolve_sensors(
         quantity = item.quantity(is_turning=item.target in turning)
         planned.append(PlannedSensor(name, item, quantity, strut))
     return tuple(planned)
+
+
+def make_reader(
+    make: Callable[[Mapping[str, VirtualSensor]], AnySensorReader],
+    sensors: Sequence[PlannedSensor],
+    source: Path,
+) -> AnySensorReader | None:
+    """What reads the sensors of bodies and joints; None where there are none.
+
+    Raises:
+        InputError: The model has not what one reads.
+    """
+    of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
+    try:
+        return make(of_model) if of_model else None
+    except ModelError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def publication_of(sensor: PlannedSensor) -> Publication:

@@ -16,6 +16,7 @@ from rig.cli.main import main
 from rig.log.file_names import ADDED_FILE
 from rig.log.reader import read_run
 from rig.pages.run_report import write_run_report
+from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.preflight_checks import Severity, check
@@ -205,6 +206,14 @@ def test_the_check_tells_which_are_corrected(tmp_path):
 def test_wrong_sensors_are_refused_with_their_key(tmp_path, sensors, message):
     with pytest.raises(InputError, match=message):
         load_plan(config(tmp_path, sensors))
+
+
+def test_what_the_model_does_not_have_is_refused_with_the_file(tmp_path):
+    plan = load_plan(config(tmp_path, {"x": {"position_of": "bdy"}}))
+    message = r"rig.yaml: virtual_sensors.x.position_of 'bdy': did you mean body"
+    for refuse in (check, build_bridge):
+        with pytest.raises(InputError, match=message):
+            refuse(plan)
 
 
 def test_a_dyno_has_those_of_its_strut_alone(tmp_path):
