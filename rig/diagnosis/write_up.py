@@ -99,8 +99,15 @@ class FitEstimates(NamedTuple):
     covariance: FitCovariance
 
     def estimate(self, variable: int, nominal: float = 0.0) -> Estimate:
-        """Value of a search variable, added to its nominal value, with its confidence interval."""
-        space, value = self.fit.space, float(self.fit.solution.values[variable])
+        """Value of a search variable, added to its nominal value, with its confidence interval.
+
+        It has none where the data say nothing of it, and no prior does: the velocity of a Stribeck
+        curve that is flat.
+        """
+        solution, space = self.fit.solution, self.fit.space
+        value = float(solution.values[variable])
+        if not (np.any(solution.jacobian[:, variable]) or solution.prior[variable]):
+            return Estimate(value + nominal, None, None)
         half = float(self.covariance.half[variable])
         low, high = float(space.low[variable]), float(space.high[variable])
         if space.logarithmic[variable]:

@@ -9,12 +9,18 @@ import pytest
 from dart_model.effects import CATALOGUE
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.evaluate import evaluate_held_out
-from rig.diagnosis.problem.build import Problems, build_problems, problem_kind
+from rig.diagnosis.problem.build import (
+    Problems,
+    build_problems,
+    build_without_delays,
+    problem_kind,
+)
 from rig.diagnosis.problem.free_run import FreeRunProblem
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
 from rig.diagnosis.problem.problem import Problem, nominal
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import validation_costs
+from rig.diagnosis.search.fit import fit_covariance, validation_costs
+from rig.diagnosis.write_up import FitEstimates
 from tests.diagnosis import little_bench, little_dyno
 
 BENCHES = {FreeRunProblem: little_bench, PrescribedProblem: little_dyno}
@@ -154,3 +160,19 @@ def with_last_fifth_held_out(learnt):
         changed.append(run._replace(grid=grid))
     problem = replace(learnt, runs=tuple(changed))
     return Problems(problem, problem, by_blocks=True)
+
+
+def test_a_parameter_that_changes_nothing_has_no_interval():
+    """Such as the velocity of a Stribeck curve at whose bound static and dynamic friction agree."""
+    problem = build_without_delays(
+        little_bench.model(), [little_bench.run(little_bench.Nothing())], 8, None
+    )
+    _, linear = first_fits(problem)
+    known = FitEstimates(linear, fit_covariance(linear)).estimate(0)
+    assert known.low < known.value < known.high
+    solution = linear.solution
+    jacobian, prior = solution.jacobian.copy(), solution.prior.copy()
+    jacobian[:, 0], prior[0] = 0.0, 0.0
+    blind = linear._replace(solution=solution._replace(jacobian=jacobian, prior=prior))
+    unknown = FitEstimates(blind, fit_covariance(blind)).estimate(0)
+    assert (unknown.value, unknown.low, unknown.high) == (known.value, None, None)
