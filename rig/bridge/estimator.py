@@ -10,11 +10,12 @@ An estimator knows no modes: when its estimate is published, and as what, is dec
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from dart_model.protocol import AnySensorReader
 from dart_model.virtual_sensors import VirtualSensor
-from rig.bridge.sensor_errors import SensorErrors, SensorGains
 from rig.bridge.values import StepInput, StrutOutput
 from rig.observers.protocol import AnyObserver
 
@@ -95,18 +96,8 @@ class Estimator(Protocol[StateT]):
         """The model under its forces, for virtual sensors; None where none moves."""
         ...
 
-    def sensor_gains(
-        self, state: StateT, reader: AnySensorReader, follows_motion: Sequence[bool]
-    ) -> SensorGains | None:
-        """Gains of the errors of virtual sensors of the model in `model_of` a state.
-
-        `follows_motion` says of each whether it errs as the model's motion does. None where no
-        observer knows of errors.
-        """
-        ...
-
-    def sensor_errors(self, state: StateT, gains: SensorGains) -> SensorErrors:
-        """What is known of the errors of virtual sensors that have these gains."""
+    def force_covariance_n2(self, state: StateT) -> NDArray[np.float64]:
+        """Covariance of the errors of the struts' forces, (struts, struts); NaN if not known."""
         ...
 
     def with_settings(

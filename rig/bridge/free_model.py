@@ -16,11 +16,9 @@ from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.sensor_errors import SensorErrors, SensorGains, find_errors, make_gains
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import TEMPERATURE
-from rig.closed_loop.sensor_response import respond_to_motion
 from rig.closed_loop.strut_response import laws_by_motion, linearise
 from rig.observers.error_model import StrutResponse
 from rig.observers.protocol import AnyObserver, Innovation, Start
@@ -329,44 +327,19 @@ class FreeModelEstimator:
             rows += [(slopes @ gains.noise @ slopes.T).ravel(), np.outer(late, late).ravel()]
         return np.array(rows)
 
-    def sensor_gains(
-        self, state: FreeModelState, reader: AnySensorReader, follows_motion: Sequence[bool]
-    ) -> SensorGains | None:
-        loaded = state.model
-        if loaded is None:
-            raise ValueError("no model moves, expected one")
-        if not any(observer.knows_std for observer in self.observers):
-            return None
-        response = respond_to_motion(
-            self._plant,
-            reader,
-            loaded.state,
-            self._at_rest(loaded.inputs),
-            self._observers.find_followed(state.observers),
-            [column for column, _ in self._motions],
-        )
-        motions = [gains for _, gains in self._motions]
-        by_force = reader.force_gains(loaded)
-        return make_gains(follows_motion, by_force, response, motions, state.input_errors)
-
-    def sensor_errors(self, state: FreeModelState, gains: SensorGains) -> SensorErrors:
-        errors = self._observers.estimate_errors(state.observers, state.t_ns)
-        return find_errors(gains, errors, self._motion_squares_m2(state))
-
-    def _motion_squares_m2(self, state: FreeModelState) -> list[float]:
-        """What is known of each motion among the inputs, as of `MeasuredInput.squares_m2`."""
-        squares_m2: list[float] = []
+    def force_covariance_n2(self, state: FreeModelState) -> Array:
+        joint = state.observers.joint
+        stds_n = [strut.force_std_n for strut in state.observers.struts]
+        known = np.diag(np.square(stds_n)) if joint is None else joint.covariance_n2.copy()
+        # The joint filter does not know what an observer of another kind adds.
+        unknown = [strut for strut, std_n in enumerate(stds_n) if math.isnan(std_n)]
+        if unknown:
+            known[unknown] = known[:, unknown] = np.nan
         if self._motions:
+            squares_m2: list[float] = []
             for item, followed in zip(self._inputs, state.inputs, strict=True):
                 squares_m2 += item.squares_m2(followed)
-        return squares_m2
-
-    def _force_covariance_n2(self, state: FreeModelState) -> Array:
-        """Covariance of the errors of the struts' forces, (struts, struts); NaN if not known."""
-        known = self._observers.force_covariance_n2(state.observers)
-        if self._motions:
-            squares_m2 = np.array(self._motion_squares_m2(state))
-            known = known + (squares_m2 @ state.input_errors).reshape(known.shape)
+            known += (np.array(squares_m2) @ state.input_errors).reshape(known.shape)
         return known
 
     def _start_of_strut(
@@ -562,7 +535,7 @@ class FreeModelEstimator:
         t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
         stds_n = [observer.force_std_n for observer in state.observers.struts]
         if self._motions:
-            stds_n = np.sqrt(self._force_covariance_n2(state).diagonal()).tolist()
+            stds_n = np.sqrt(self.force_covariance_n2(state).diagonal()).tolist()
         for strut, observer in enumerate(state.observers.struts):
             if (
                 observer.is_disturbed

@@ -11,8 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
 from dart_model.errors import ModelError
@@ -21,7 +23,6 @@ from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.sensor_errors import SensorErrors, SensorGains
 from rig.bridge.tracked_motion import SETTLED, TrackedMotion, predict_motion, update_motion
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -167,15 +168,9 @@ class PrescribedMotionEstimator:
     def model_of(self, state: PrescribedMotionState) -> None:
         del state
 
-    def sensor_gains(
-        self, state: PrescribedMotionState, reader: AnySensorReader, follows_motion: Sequence[bool]
-    ) -> SensorGains:
-        """There are none: no reader was made."""
-        raise NotImplementedError
-
-    def sensor_errors(self, state: PrescribedMotionState, gains: SensorGains) -> SensorErrors:
-        """There are none either."""
-        raise NotImplementedError
+    def force_covariance_n2(self, state: PrescribedMotionState) -> NDArray[np.float64]:
+        del state
+        return np.full((self.struts, self.struts), np.nan)
 
     def step(
         self, state: PrescribedMotionState, step_input: StepInput

@@ -1,19 +1,20 @@
 """What virtual sensors show at a tick: variables of the model that follows the bench.
 
 Bodies and joints move as the model does, under the estimated forces of the struts. Where an
-observer states how well it knows these forces and the motion, so is known what depends on them.
+observer states how well it knows a force, so is known what depends on it.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from dart_model.protocol import AnySensorReader
-from rig.bridge.estimator import AnyEstimator
-from rig.bridge.sensor_errors import SensorGains
 from rig.bridge.values import StrutOutput
+
+Array = NDArray[np.float64]
 
 _OF_STRUT = {"force_of": (0, 1), "power_of": (2, 3), "energy_of": (4, None)}
 """Places of value and standard deviation among the numbers of a strut."""
@@ -27,26 +28,26 @@ class SensorPlace(NamedTuple):
     Attributes:
         kind: Its key, as of `dart_model.virtual_sensors`.
         strut: Index of the strut that it is of; -1 for a body or joint.
-        known_by: What its standard deviation, which is shown, too, follows from, as of
-            `dart_model.virtual_sensors.SensedQuantity`; empty where it has none.
+        has_std: Whether its standard deviation is shown, too.
     """
 
     kind: str
     strut: int
-    known_by: str
+    has_std: bool
 
 
 class SensedState(Struct, frozen=True, gc=False):
     """What is remembered between two ticks.
 
     Attributes:
-        gains: Gains of the errors of the model's sensors; None where nothing is known of them.
+        gains: Change of each sensor of the model by a newton in each strut, where it started,
+            shape (sensors, struts).
         powers_w: Power that each strut took.
         energies_j: Energy that each strut has taken since the model started.
     """
 
     t_ns: int
-    gains: SensorGains | None
+    gains: Array
     powers_w: tuple[float, ...]
     energies_j: tuple[float, ...]
 
@@ -61,9 +62,8 @@ class VirtualSensors:
 
     def __init__(self, sensors: Sequence[SensorPlace], reader: AnySensorReader | None) -> None:
         self._reader = reader
-        self._follows_motion = [it.known_by == "motion" for it in sensors if it.strut < 0]
-        of_model = len(self._follows_motion)
-        self._no_stds = [math.nan] * of_model
+        of_model = sum(sensor.strut < 0 for sensor in sensors)
+        self._shows_std = any(sensor.strut < 0 and sensor.has_std for sensor in sensors)
         self._order: list[int] = []
         next_of_model = 0
         for sensor in sensors:
@@ -74,7 +74,8 @@ class VirtualSensors:
                 begin = 2 * of_model + _STRUT_NUMBERS * sensor.strut
                 at, at_std = _OF_STRUT[sensor.kind]
                 value, std = begin + at, begin + (at_std or 0)
-            self._order += [value, std] if sensor.known_by else [value]
+            self._order += [value, std] if sensor.has_std else [value]
+        self._no_stds = [np.nan] * of_model
 
     @property
     def reads_model(self) -> bool:
@@ -83,55 +84,51 @@ class VirtualSensors:
 
     def read(
         self,
-        before: SensedState | None,
+        state: SensedState | None,
         t_ns: int,
-        estimator: AnyEstimator,
-        state: Any,
+        loaded: Any,
         struts: Sequence[StrutOutput],
+        covariance_n2: Callable[[], Array],
     ) -> tuple[SensedState, list[float]]:
-        """State and readings at a tick at whose end the estimator has a state.
+        """State and readings at a tick whose model is `loaded` and whose struts act as estimated.
 
-        The struts act as estimated. The readings are the value of each sensor in SI, followed by
-        its standard deviation where it has one. If no model moves, there are sensors of struts
-        alone.
+        `covariance_n2` is that of the errors of their forces, shape (struts, struts).
+
+        The readings are the value of each sensor in SI, followed by its standard deviation where it
+        has one. `loaded` is None where no model moves; then there are sensors of struts alone.
         """
-        sensed = self._advance(before, t_ns, estimator, state, struts)
+        state = self._advance(state, t_ns, loaded, struts)
         known: list[float] = []
         if self._reader is not None:
             residual_n = [strut.force_n - strut.law_force_n for strut in struts]
-            known, stds = self._reader.read(estimator.model_of(state), residual_n), self._no_stds
-            if sensed.gains is not None:
-                errors = estimator.sensor_errors(state, sensed.gains)
-                known, stds = (errors.corrections + known).tolist(), errors.stds.tolist()
-            known += stds
-        motions = zip(struts, sensed.powers_w, sensed.energies_j, strict=True)
+            known = self._reader.read(loaded, residual_n)
+            stds = self._no_stds
+            # Not NaN: the observers know it.
+            if self._shows_std and struts[0].force_std_n == struts[0].force_std_n:
+                variances = ((state.gains @ covariance_n2()) * state.gains).sum(axis=1)
+                stds = np.sqrt(variances).tolist()
+            known = known + stds
+        motions = zip(struts, state.powers_w, state.energies_j, strict=True)
         for strut, power_w, energy_j in motions:
             std_n = strut.force_std_n
             std_w = abs(strut.velocity_m_per_s) * std_n
             known += (strut.force_n, std_n, power_w, std_w, energy_j)
-        return sensed, [known[index] for index in self._order]
+        return state, [known[index] for index in self._order]
 
     def _advance(
-        self,
-        before: SensedState | None,
-        t_ns: int,
-        estimator: AnyEstimator,
-        state: Any,
-        struts: Sequence[StrutOutput],
+        self, state: SensedState | None, t_ns: int, loaded: Any, struts: Sequence[StrutOutput]
     ) -> SensedState:
         powers_w = tuple([-strut.force_n * strut.velocity_m_per_s for strut in struts])
-        if before is None:
-            gains = None
-            if self._reader is not None:
-                gains = estimator.sensor_gains(state, self._reader, self._follows_motion)
-            return SensedState(t_ns, gains, powers_w, (0.0,) * len(struts))
-        half_s = 0.5e-9 * (t_ns - before.t_ns)
+        if state is None:
+            gains = [] if self._reader is None else self._reader.force_gains(loaded)
+            return SensedState(t_ns, np.array(gains), powers_w, (0.0,) * len(struts))
+        half_s = 0.5e-9 * (t_ns - state.t_ns)
         energies_j = tuple(
             [
                 energy_j + half_s * (before_w + now_w)
                 for energy_j, before_w, now_w in zip(
-                    before.energies_j, before.powers_w, powers_w, strict=True
+                    state.energies_j, state.powers_w, powers_w, strict=True
                 )
             ]
         )
-        return SensedState(t_ns, before.gains, powers_w, energies_j)
+        return SensedState(t_ns, state.gains, powers_w, energies_j)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C
-from dart_model.protocol import AnyPlant
+from dart_model.protocol import AnyPlant, AnySensorReader
 from rig.closed_loop.derivatives import central_differences
 
 Array = NDArray[np.float64]
@@ -37,6 +37,9 @@ _FORCE_STEP_N = 1e-2
 
 _INDEPENDENT = 1e-6
 """Least singular value of columns of unit length: a hundred times what the differences leave."""
+
+_SEEN = 1e-4
+"""Share of a sensor's change below which what is left of it is that of the differences."""
 
 
 class Unknown(NamedTuple):
@@ -132,3 +135,43 @@ def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs:
         return np.concatenate([by_force[:, unknown.strut], np.zeros(outputs)])
     to_heights = np.array([float(strut == unknown.strut) for strut in measured])
     return np.concatenate([np.zeros(len(by_force)), to_heights])
+
+
+def find_corrected(
+    plant: AnyPlant,
+    reader: AnySensorReader,
+    heights_m: Sequence[float],
+    measured: Sequence[int],
+    observed: Sequence[int],
+) -> list[bool]:
+    """Whether each sensor of a model is determined by what is measured, about rest at some heights.
+
+    It is where heights and rates of the measured struts, given by index, determine it, and where no
+    force changes it but those of the observed struts.
+    """
+    start = np.array(plant.numbers(plant.init(heights_m)))
+    no_inputs, no_forces = (0.0,) * plant.inputs, (0.0,) * plant.struts
+
+    def read(x: Array) -> Array:
+        loaded = plant.load(plant.state_of(x.tolist()), no_forces, no_inputs, AMBIENT_C)
+        return np.array(reader.read(loaded, no_forces))
+
+    def motion(x: Array) -> Array:
+        struts = plant.state_of(x.tolist()).struts
+        return np.array([struts[strut] for strut in measured]).ravel()
+
+    steps = [_STEP] * len(start)
+    rows = central_differences(lambda d: read(start + d), steps)
+    seen = central_differences(lambda d: motion(start + d), steps)
+    # An effect's internal state follows the motion.
+    count = len(start) - plant.internal_states
+    rows, seen = rows[:, :count], seen[:, :count]
+    left = rows - np.linalg.lstsq(seen.T, rows.T, rcond=None)[0].T @ seen
+    loaded = plant.load(plant.init(heights_m), no_forces, no_inputs, AMBIENT_C)
+    gains = np.array(reader.force_gains(loaded))
+    others = [strut for strut in range(plant.struts) if strut not in observed]
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    is_seen = np.linalg.norm(left, axis=1) < _SEEN * size
+    largest = np.maximum(np.abs(gains).max(axis=1), 1e-300)
+    is_acted_on = np.abs(gains[:, others]).max(axis=1, initial=0.0) > _SEEN * largest
+    return [bool(item) for item in is_seen & ~is_acted_on]

@@ -47,7 +47,7 @@ from rig.observers.filter_lag import (
     make_lag_filter,
     update_lag,
 )
-from rig.observers.protocol import Innovation, MotionError, Remark, Start, TuningTask
+from rig.observers.protocol import Innovation, Remark, Start, TuningTask
 
 Array = NDArray[np.float64]
 Mean = tuple[float, float, float, float, float]
@@ -150,9 +150,6 @@ class Constants(Struct, frozen=True, gc=False):
         longest_ns: How long after the last measurement the error is predicted.
         forgotten_ns: Time after which the last measurement says nothing more.
         lag: Filter of the innovations that shows a lag.
-        motion: Steady variance of the error, covariance with its rate, and variance of that, in SI
-            at a measurement.
-        late: Error and its rate over a lag of the acceleration that changes slowly.
     """
 
     steady: Steady
@@ -165,8 +162,6 @@ class Constants(Struct, frozen=True, gc=False):
     longest_ns: int
     forgotten_ns: int
     lag: LagFilter
-    motion: tuple[float, float, float]
-    late: tuple[float, float]
 
 
 class ErrorState(Struct, frozen=True, gc=False):
@@ -365,36 +360,6 @@ class ErrorFilter:
         variance_of_noise = state.scale * max(variance, 0.0) * unit * unit
         return math.sqrt(variance_of_noise + lag_variance(state.lag, constants.lag, state.scale))
 
-    def motion_error(self, state: ErrorState, t_ns: int, mean: Sequence[float]) -> MotionError:
-        """Error of height and rate at a time at which the mean is predicted."""
-        constants, interval_ns = state.constants, state.start.interval_ns
-        number = (min(t_ns - state.t_ns, constants.forgotten_ns) + interval_ns // 2) // interval_ns
-        if state.covariance is None and number < 1:
-            variances = constants.motion
-        else:
-            variances = self._motion_variances(state, number)
-        scale, (of_x, of_v) = state.scale, constants.late
-        lag = lag_variance(state.lag, constants.lag, scale)
-        return MotionError(
-            mean[0],
-            mean[1],
-            scale * variances[0] + lag * of_x * of_x,
-            scale * variances[1] + lag * of_x * of_v,
-            scale * variances[2] + lag * of_v * of_v,
-        )
-
-    def _motion_variances(self, state: ErrorState, number: int) -> tuple[float, float, float]:
-        """Variance of the error, covariance with its rate and variance of that, in SI.
-
-        Some intervals after the last measurement, for noise as configured.
-        """
-        covariance, pace = state.covariance, self.pace(state.start)
-        if covariance is None:
-            covariance = _steady(pace).covariance
-        if number >= 1:
-            covariance = predict_covariance(covariance, pace, number)
-        return _motion_in_si(covariance, self.noise_std_m, self.omega)
-
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
         """State after the virtual force has changed."""
         newest, t_last_ns, inputs = (t_ns, acceleration), state.t_ns, state.inputs
@@ -447,8 +412,6 @@ class ErrorFilter:
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
             self.forgotten_ns,
             make_lag_filter(omega, interval_ns * 1e-9, gain[:2], steady.innovation * variance_m2),
-            _motion_in_si(steady.covariance, self.noise_std_m, omega),
-            ((1.0 - gain[0]) * interval_ns * 1e-9 / gain[1], gain[0] / gain[1]),
         )
 
     def pace(self, start: Start) -> "Pace":
@@ -582,17 +545,6 @@ def _ahead(covariance: Array, pace: Pace, number: int) -> float:
         covariance = predict_covariance(covariance, pace, number)
     row = np.array([-pace.stiffness, -pace.damping, 1.0, 0.0, 0.0])
     return float(row @ covariance @ row)
-
-
-def _motion_in_si(
-    covariance: Array, noise_std_m: float, omega: float
-) -> tuple[float, float, float]:
-    variance_m2 = noise_std_m**2
-    return (
-        float(covariance[0, 0]) * variance_m2,
-        float(covariance[0, 1]) * variance_m2 * omega,
-        float(covariance[1, 1]) * variance_m2 * omega**2,
-    )
 
 
 @lru_cache(maxsize=1024)

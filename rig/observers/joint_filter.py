@@ -45,7 +45,7 @@ from rig.observers.error_filter import (
 )
 from rig.observers.joint_lag import JointLag
 from rig.observers.joint_model import ErrorMotion, Inputs, JointModel
-from rig.observers.protocol import REFERENCE_HEIGHT, EstimateErrors, Innovation
+from rig.observers.protocol import REFERENCE_HEIGHT, Innovation
 from rig.observers.sensor_health import GATE, SILENT, SensorHealth
 
 Array = NDArray[np.float64]
@@ -108,7 +108,6 @@ class JointState(Struct, frozen=True, gc=False):
         references: Of each strut.
         health: Of each further sensor, by its channel.
         lag: Lag behind forces that change faster than the filter allows for.
-        now: What is known at the tick.
         struts: What is said of each strut.
         covariance_n2: Of the errors of all struts' forces, shape (struts, struts).
     """
@@ -121,7 +120,6 @@ class JointState(Struct, frozen=True, gc=False):
     references: tuple[Reference, ...]
     health: dict[int, SensorHealth]
     lag: JointLag
-    now: Point
     struts: tuple[JointStrut, ...]
     covariance_n2: Array
 
@@ -177,7 +175,7 @@ class JointFilter:
         lag = model.lag.init(t_ns, None if before is None else before.lag)
         no_forces_n2 = np.zeros((0, 0))
         state = JointState(
-            self, point, model.motion, inputs, (), references, health, lag, point, (), no_forces_n2
+            self, point, model.motion, inputs, (), references, health, lag, (), no_forces_n2
         )
         return self._conclude(state, t_ns, self._no_limits_n)
 
@@ -307,8 +305,7 @@ class JointFilter:
         residuals_n = model.laws_n(mean, state.motion) + model.residuals @ mean
         virtual_n = np.minimum(np.maximum(self._required @ mean, -limits_n), limits_n)
         number = model.grid_index(t_ns) - model.grid_index(point.t_ns)
-        now = Point(t_ns, mean, model.ahead(point.covariance, number))
-        covariance = model.force_covariance(now.covariance)
+        covariance = model.force_covariance(model.ahead(point.covariance, number))
         is_disturbed = np.diagonal(covariance) > STEADY_VARIANCE * model.usual_n2
         is_disturbed[self.followed] |= np.abs(virtual_n) >= limits_n
         scales = np.array([reference.scale for reference in state.references])
@@ -337,19 +334,7 @@ class JointFilter:
             for strut, (reference, force_n, residual_n, std_n, disturbed) in enumerate(every)
         )
         inputs = self._with_input(state.inputs, point.t_ns, t_ns, virtual_n)
-        return replace(state, inputs=inputs, now=now, struts=struts, covariance_n2=covariance)
-
-    def estimate_errors(self, state: JointState, covariance_n2: Array) -> EstimateErrors:
-        """What is known of the errors at the tick, with that of all struts' forces."""
-        scales = [state.references[strut].scale for strut in self.followed]
-        own = [state.references[strut].scale for strut in self._model.own]
-        lag_n2 = self._model.lag.variances_n2(state.lag, np.array(own))
-        motion = self._model.motion_covariance(state.now.covariance, scales, lag_n2)
-        forces = len(covariance_n2)
-        covariance = np.zeros((forces + len(motion), forces + len(motion)))
-        covariance[:forces, :forces] = covariance_n2
-        covariance[forces:, forces:] = motion
-        return EstimateErrors(self._model.motion_mean(state.now.mean), covariance.ravel())
+        return replace(state, inputs=inputs, struts=struts, covariance_n2=covariance)
 
     def _with_input(self, inputs: Inputs, known_ns: int, t_ns: int, force_n: Array) -> Inputs:
         if t_ns <= inputs[-1][0]:

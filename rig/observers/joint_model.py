@@ -146,9 +146,6 @@ class JointModel:
         force_errors = self.residuals.copy()
         force_errors[:, : 2 * n] = model.laws
         self._scaled_forces = force_errors * self.units
-        struts = list(self.followed)
-        self._motions = np.vstack([self.heights[struts], self.rates[struts]])
-        self._scaled_motions = self._motions * self.units
         self._push = np.zeros((self.size, len(self.followed)))
         self._push[n : 2 * n] = -model.by_force[:, list(self.followed)]
         self._generator = self._make_generator()
@@ -163,7 +160,6 @@ class JointModel:
         late = 1 + round(self.delay_ns / self.interval_ns)
         self.usual_n2 = np.diagonal(self.force_covariance(self.ahead(self.steady, late * _GRID)))
         self.lag = self._make_lag(gains, innovations)
-        self._late = self._make_late(gains)
 
     def _make_units(self) -> Array:
         of_rate = self._unit_m / self._unit_s
@@ -251,16 +247,12 @@ class JointModel:
         """How many heights of each followed strut come in an interval."""
         return np.array([self.interval_ns / self.starts[it].interval_ns for it in self.followed])
 
-    def _in_si(self, gains: Array) -> Array:
-        """Gains by the followed heights in m, as often as these come in an interval."""
-        stds_m = np.array([item.noise_std_m for item in self.followed.values()])
-        return self.units[:, None] * gains / stds_m * self._often()
-
     def _make_lag(self, gains: Array, innovations: Array) -> JointLagFilter:
         stds_m = np.array([item.noise_std_m for item in self.followed.values()])
         # An innovation stands until the next one: seldom ones act as weakly as often as they come,
         # and are noise of a lower frequency.
-        often, in_si = self._often(), self._in_si(gains)
+        often = self._often()
+        in_si = self.units[:, None] * gains / stds_m * often
         stds_m = stds_m / np.sqrt(often)
         struts = list(self.followed)
         n, interval_s = self._n, self.interval_ns * 1e-9
@@ -281,22 +273,6 @@ class JointModel:
             self.forces_by_accelerations(self.own),
             innovations * np.outer(stds_m, stds_m),
         )
-
-    def _make_late(self, gains: Array) -> Array:
-        """Errors of the followed heights and rates by lags of the observed struts' forces.
-
-        Of forces that change slowly: from the equations of `rig.observers.joint_lag`.
-        """
-        per_s = self._in_si(gains) * 1e9 / self.interval_ns
-        of_error, of_rate = per_s[: self._n], per_s[self._n : 2 * self._n]
-        # At rest: dx/dt = v - L_1 nu and dv/dt = A (x, v) + B d - L_2 nu vanish with nu = H x.
-        heights = self._model.heights[list(self.followed)]
-        own = self._model.free + self._model.by_force @ self._model.laws
-        by_error, by_rate = own[:, : self._n], own[:, self._n :]
-        system = (of_rate - by_rate @ of_error) @ heights - by_error
-        errors = np.linalg.pinv(system, rcond=1e-9) @ self._model.by_force[:, self.own]
-        left = errors - of_error @ heights @ errors * self.interval_ns * 1e-9
-        return np.vstack([heights @ left, heights @ of_error @ heights @ errors])
 
     def prior(self) -> Array:
         """Covariance in units before anything was measured but the heights at the start."""
@@ -321,20 +297,6 @@ class JointModel:
         Of the force that a model's law lacks where the model is.
         """
         return self._scaled_forces @ covariance @ self._scaled_forces.T
-
-    def motion_mean(self, mean: Array) -> Array:
-        """Errors of the followed struts' heights (m), then of their rates (m/s), by the state."""
-        return np.asarray(self._motions @ mean)
-
-    def motion_covariance(self, covariance: Array, scales: Sequence[float], lag_n2: Array) -> Array:
-        """Covariance of these errors by that of the state in units.
-
-        `scales` are the variances of the followed heights over the configured ones, `lag_n2` those
-        of the observed struts' forces by their lag.
-        """
-        # One scale for all: errors of two heights that nearly cancel would not do so otherwise.
-        known: Array = self._scaled_motions @ covariance @ self._scaled_motions.T * np.mean(scales)
-        return known + (self._late * lag_n2) @ self._late.T
 
     def laws_n(self, mean: Array, motion: ErrorMotion) -> Array:
         """Forces by which the laws err because the model is not where the bench is, (struts,)."""

@@ -30,7 +30,6 @@ from rig.observers.filter_lag import NO_LAG
 from rig.observers.protocol import (
     AnyObserver,
     Innovation,
-    MotionError,
     Remark,
     Search,
     SensorStep,
@@ -66,8 +65,6 @@ class KalmanState(Struct, frozen=True, gc=False):
     force_std_n: float
     measured_ns: int
     is_disturbed: bool = False
-    height_error_m: float = 0.0
-    velocity_error_m_per_s: float = 0.0
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -152,13 +149,7 @@ class KalmanObserver:
             std_n,
             error.t_ns,
             is_disturbed,
-            x,
-            v,
         )
-
-    def motion_error(self, state: KalmanState, t_ns: int) -> MotionError:
-        mean = state.height_error_m, state.velocity_error_m_per_s
-        return self.filter.motion_error(state.error, t_ns, mean)
 
     def with_slopes(
         self, state: KalmanState, stiffness_n_per_m: float, damping_n_s_per_m: float

@@ -85,9 +85,6 @@ class NoObserver:
         del state, innovation
         return NoState(t_ns)
 
-    def motion_error(self, state: NoState, t_ns: int) -> None:
-        del state, t_ns
-
     def with_slopes(
         self, state: NoState, stiffness_n_per_m: float, damping_n_s_per_m: float
     ) -> NoState:

@@ -180,9 +180,6 @@ class PiObserver:
             is_disturbed,
         )
 
-    def motion_error(self, state: PiState, t_ns: int) -> None:
-        del state, t_ns
-
     def with_slopes(
         self, state: PiState, stiffness_n_per_m: float, damping_n_s_per_m: float
     ) -> PiState:

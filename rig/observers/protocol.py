@@ -32,38 +32,6 @@ class Innovation(Struct, frozen=True, gc=False):
     channel: int = REFERENCE_HEIGHT
 
 
-class MotionError(NamedTuple):
-    """Error of the model's height at a strut and of its rate, of the bench less the model.
-
-    Attributes:
-        height_m: Mean of the one.
-        velocity_m_per_s: Mean of the other.
-        height_m2: Variance of the one.
-        product_m2_per_s: Covariance of both.
-        velocity_m2_per_s2: Variance of the other.
-    """
-
-    height_m: float
-    velocity_m_per_s: float
-    height_m2: float
-    product_m2_per_s: float
-    velocity_m2_per_s2: float
-
-
-class EstimateErrors(NamedTuple):
-    """What observers know of the errors of their estimates.
-
-    Attributes:
-        mean: Of the bench less the model: heights of the struts with known errors (m), then their
-            rates (m/s), shape (2 known,).
-        covariance: Of the errors of all struts' forces (N), then of these heights and rates, row by
-            row, n² numbers for n = struts + 2 known; NaN of a force that nothing is known of.
-    """
-
-    mean: Sequence[float] | NDArray[np.float64]
-    covariance: Sequence[float] | NDArray[np.float64]
-
-
 class Start(Struct, frozen=True, gc=False):
     """What an observer is given when the model starts.
 
@@ -213,10 +181,6 @@ class Observer(Protocol[StateT]):
 
         `innovation` is that of a new measurement of the height, None where no frame came.
         """
-        ...
-
-    def motion_error(self, state: StateT, t_ns: int) -> MotionError | None:
-        """What the strut's own observer knows of its error at a tick; None where it knows none."""
         ...
 
     def with_slopes(

@@ -1,18 +1,13 @@
 """The observers of all struts of a model: each alone, or those of coupled struts in one filter."""
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from rig.observers.error_model import ErrorModel
 from rig.observers.joint_filter import JointFilter, JointState
 from rig.observers.joint_model import FollowedStrut, JointModel
-from rig.observers.protocol import AnyObserver, EstimateErrors, Innovation, ObserverState, Start
-
-Array = NDArray[np.float64]
+from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 
 
 class ObserversState(Struct, frozen=True, gc=False):
@@ -101,49 +96,6 @@ class StrutObservers:
             )
         )
         return self._join(struts, joint)
-
-    def find_followed(self, state: ObserversState) -> list[int]:
-        """Indices of the struts the error of whose motion is known."""
-        if state.joint is not None:
-            return state.joint.filter.followed
-        return [strut for strut, it in enumerate(self.each) if it.force_filter is not None]
-
-    def force_covariance_n2(self, state: ObserversState) -> Array:
-        """Covariance of the errors of the struts' forces, (struts, struts); NaN if not known."""
-        stds_n = [strut.force_std_n for strut in state.struts]
-        if state.joint is None:
-            return np.diag(np.square(stds_n))
-        known = state.joint.covariance_n2
-        # The joint filter does not know what an observer of another kind adds.
-        unknown = [strut for strut, std_n in enumerate(stds_n) if math.isnan(std_n)]
-        if unknown:
-            known = known.copy()
-            known[unknown] = known[:, unknown] = np.nan
-        return known
-
-    def estimate_errors(self, state: ObserversState, t_ns: int) -> EstimateErrors:
-        """What is known of the errors at a tick, of the motion of these struts."""
-        if state.joint is not None:
-            covariance_n2 = self.force_covariance_n2(state)
-            return state.joint.filter.estimate_errors(state.joint, covariance_n2)
-        motions = [
-            error
-            for observer, strut in zip(self.each, state.struts, strict=True)
-            if (error := observer.motion_error(strut, t_ns)) is not None
-        ]
-        forces, count = len(state.struts), len(motions)
-        size = forces + 2 * count
-        covariance = [0.0] * (size * size)
-        for place, strut in enumerate(state.struts):
-            covariance[place * (size + 1)] = strut.force_std_n**2
-        for index, error in enumerate(motions):
-            height, rate = forces + index, forces + count + index
-            covariance[height * (size + 1)] = error.height_m2
-            covariance[rate * (size + 1)] = error.velocity_m2_per_s2
-            both = error.product_m2_per_s
-            covariance[height * size + rate] = covariance[rate * size + height] = both
-        heights = [error.height_m for error in motions]
-        return EstimateErrors(heights + [error.velocity_m_per_s for error in motions], covariance)
 
     def with_slopes(
         self, state: ObserversState, slopes: Sequence[tuple[float, float]]

@@ -20,9 +20,8 @@ from rig.bus.bus import SHARED_INTERFACES, WITHOUT_BIT_RATE, BusError, check_int
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.observability import Unknown, linear_model, observability
+from rig.closed_loop.observability import Unknown, find_corrected, linear_model, observability
 from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
-from rig.closed_loop.sensor_response import find_corrected
 from rig.closed_loop.strut_response import (
     FAST_SPEED_M_PER_S,
     find_driving_speeds_m_per_s,

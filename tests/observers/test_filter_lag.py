@@ -41,21 +41,6 @@ def test_without_noise_the_innovations_show_the_error_of_the_force(share):
     assert np.var(true) * 0.8 < variance < 2.2 * np.var(true)
 
 
-def test_behind_a_force_that_bends_the_motion_lags_as_stated():
-    """A force with a constant third derivative: the errors of height and rate are constant, too."""
-    follower = ErrorFilter(bandwidth_hz=BANDWIDTH_HZ, noise_std_m=1e-12)
-    state = follower.steady_state(Start(0, 1.0, INTERVAL_NS, 0, 0.0, 0.0, ()))
-    for number in range(1, 3000):
-        t_s = number * 1e-3
-        state = follower.update(state, Innovation(t_s**5 / 60.0, number * INTERVAL_NS))
-    motion = follower.motion_error(state, state.t_ns, state.mean)
-    missed = np.array([t_s**5 / 60.0, t_s**4 / 12.0]) - motion[:2]
-    # For continuous measurements; the corner times the interval is an eighth.
-    stds = np.sqrt([motion.height_m2, motion.velocity_m2_per_s2])
-    assert stds == pytest.approx(np.abs(missed), rel=0.2)
-    assert motion.product_m2_per_s == pytest.approx(stds.prod(), rel=0.05)
-
-
 def test_white_innovations_show_no_lag():
     """Their mean square is that of the filtered noise, in closed form; nothing is beyond it."""
     innovation_m2 = 4e-12

@@ -5,16 +5,14 @@ import math
 import pytest
 
 from tests.diagnosis.mechanisms import GRAVITY
-from tests.observers.sensor_errors import ON_A_ROAD, ON_ARM, ON_POSTS, PivotArm, rows
+from tests.observers.sensor_errors import PivotArm, rows
 
 SENSORS = [
     ("quarter car on a road", "load of tyre"),
     ("quarter car on a road", "acceleration of the seat"),
-    *(("quarter car on a road", it) for it in ON_A_ROAD),
     *(("car on four posts", f"load of tyre {corner}") for corner in ("fl", "fr", "rl", "rr")),
     ("car on four posts", "acceleration of the seat"),
-    *(("car on four posts", it) for it in ON_POSTS),
-    *(("trailing arm", it) for it in ON_ARM),
+    ("trailing arm", "reaction in the pivot"),
 ]
 
 
@@ -30,7 +28,7 @@ def test_the_arms_own_reaction_is_that_of_statics_at_rest():
     """Pivot and strut carry the weight, and moments about the pivot vanish."""
     arm = PivotArm()
     arm.load_n = lambda _t: 0.0
-    _, heights, (_, _, reactions) = arm.motion(0.02, 1000)
+    _, heights, reactions = arm.motion(0.02, 1000)
     angle = arm._angle_of(float(heights[0, 0]))
     slope = arm.length(angle)[1]
     weight_n = GRAVITY * (arm.arm_kg + arm.hub_kg)

@@ -23,7 +23,6 @@ from rig.plan.preflight_checks import Severity, check
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.trajectory import simulate
 
 SENSORS = {
     "seat": {"acceleration_of": "body", "axis": [0, 0, 1]},
@@ -32,8 +31,6 @@ SENSORS = {
     "power": {"power_of": "suspension"},
     "heat": {"energy_of": "suspension"},
 }
-
-KALMAN = {"kind": "kalman", "filter": {"bandwidth_hz": 18, "noise_std_m": 5.0e-6}}
 
 OWN_MESSAGE = """
 BO_ 901 SIM_2: 8 RIG
@@ -93,32 +90,6 @@ def test_the_log_has_a_column_of_each_that_belongs_to_the_others(ended):
     np.testing.assert_allclose(run["power.power_w"][known], power_w[known])
     sums = np.concatenate([[0.0], np.cumsum(0.5e-3 * (power_w[known][1:] + power_w[known][:-1]))])
     np.testing.assert_allclose(run["heat.energy_j"][known], sums, atol=1e-6)
-
-
-def test_a_position_is_as_close_to_the_bench_as_its_deviation_says(ended):
-    """The hub against the equations of the bench; what it lacks is found with a lag."""
-    run = open_run(ended[1].folder)
-    bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
-    truth = simulate(bench, round(3e9), 500_000)
-    up_m = np.interp(run.t_s, truth.t_ns * 1e-9, truth.height_m[:, :2].sum(axis=1))
-    counts = run.t_s > 1.0
-    std_m = run["hub.position_std_m"][counts]
-    missed = np.abs(run["hub.position_m"] - up_m)[counts]
-    assert 0.9 < np.mean(missed < 1.96 * std_m) < 0.995
-    assert std_m.max() < 5e-5
-
-
-@pytest.mark.parametrize(
-    ("suspension", "tyre"), [({"kind": "pi"}, {"kind": "pi"}), (KALMAN, {"kind": "none"})]
-)
-def test_a_position_that_no_deviation_is_known_of_has_none(tmp_path, suspension, tyre):
-    """Observers that state no deviation, and a tyre whose height is not used."""
-    given = config(tmp_path, observers={"tyre": tyre, "suspension": suspension})
-    plan = load_plan(given, duration_s=0.5)
-    bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
-    run = open_run(with_bench(plan, bench, tmp_path / "run", lockstep=True).folder)
-    assert np.isfinite(run["hub.position_m"]).mean() > 0.9
-    assert np.isnan(run["hub.position_std_m"]).all()
 
 
 def test_the_bus_has_what_the_log_has(ended):
