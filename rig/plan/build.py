@@ -57,7 +57,8 @@ def _virtual_sensors(plan: Plan, estimator: AnyEstimator) -> VirtualSensors | No
     sensors = plan.virtual_sensors
     if not sensors:
         return None
-    reader = make_reader(estimator.read_model, sensors, plan.source)
+    of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
+    reader = make_reader(estimator.read_model, of_model, plan.source) if of_model else None
     return VirtualSensors([item.place for item in sensors], reader)
 
 

@@ -126,11 +126,11 @@ def _virtual_sensors(plan: Plan, plant: AnyPlant) -> list[Finding]:
     """Which virtual sensors the measured heights correct."""
     measured = [i for i, strut in enumerate(plan.struts) if strut.observer.requires_height]
     observed = [i for i in measured if plan.struts[i].observer.estimates_force]
-    of_model = [it.name for it in plan.virtual_sensors if it.strut < 0]
-    reader = make_reader(plant.virtual_sensors, plan.virtual_sensors, plan.source)
+    of_model = {it.name: it.sensor for it in plan.virtual_sensors if it.strut < 0}
     corrected: dict[str, bool] = {}
-    if reader is not None:
+    if of_model:
         rest_m = [strut.free_length_m for strut in plan.struts]
+        reader = make_reader(plant.virtual_sensors, of_model, plan.source)
         found = find_corrected(plant, reader, rest_m, measured, observed)
         corrected = dict(zip(of_model, found, strict=True))
     findings: list[Finding] = []

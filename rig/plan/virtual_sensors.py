@@ -1,6 +1,6 @@
 """Virtual sensors of a plan: what each reads, its column in the log, and its signal on the bus."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,17 +87,16 @@ def resolve_sensors(
 
 def make_reader(
     make: Callable[[Mapping[str, VirtualSensor]], AnySensorReader],
-    sensors: Sequence[PlannedSensor],
+    sensors: Mapping[str, VirtualSensor],
     source: Path,
-) -> AnySensorReader | None:
-    """What reads the sensors of bodies and joints; None where there are none.
+) -> AnySensorReader:
+    """What reads sensors of bodies and joints.
 
     Raises:
         InputError: The model has not what one reads.
     """
-    of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
     try:
-        return make(of_model) if of_model else None
+        return make(sensors)
     except ModelError as error:
         raise InputError(f"{source}: {error}") from None
 
