@@ -274,7 +274,9 @@ def tick_subjects() -> dict[str, Subject]:
 def test_a_whole_tick_against_the_bare_dart_loop(capsys):
     found = compare_rounds(tick_subjects(), capsys)
     tick = found["whole tick of the bridge"]
-    assert np.median(tick / found["hand-written loop"]) <= 3.2  # measured: 2.8 to 3.0
+    assert (
+        np.median(tick / found["hand-written loop"]) <= 3.7
+    )  # measured: 2.8 to 3.0; with a Python that is a fifth faster by hand 3.5
 
 
 def observer_subjects() -> dict[str, Subject]:
@@ -437,4 +439,4 @@ def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
         print(
             f"\nreplay: {replay_us:.1f} us a tick, {1e6 / replay_us:.0f} ticks a second of a core"
         )
-    assert replay_us / by_hand_us <= 3.9  # measured: 3.4 to 3.6
+    assert replay_us / by_hand_us <= 4.4  # measured: 3.4 to 3.6
