@@ -439,4 +439,4 @@ def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
         print(
             f"\nreplay: {replay_us:.1f} us a tick, {1e6 / replay_us:.0f} ticks a second of a core"
         )
-    assert replay_us / by_hand_us <= 4.4  # measured: 3.4 to 3.6
+    assert replay_us / by_hand_us <= 4.4  # measured: 3.4 to 3.6; with Debian's Python 4.0
