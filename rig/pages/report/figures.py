@@ -323,7 +323,7 @@ def held_out_plot(
         "Load cell and model along prescribed motions that are held-out data. A loop over velocity "
         "is an internal state or a spring, a loop over height is what the damper dissipates."
         if of_force
-        else "Heights that are held-out data; the measured inputs of the bench alone drive the model."
+        else "Heights that are held-out data; the measured inputs alone drive the model."
     )
     last = " and, last, the error after the correction at its own scale" if len(shown) > 1 else ""
     caption = (
