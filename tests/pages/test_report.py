@@ -389,7 +389,7 @@ def test_held_out_forces_are_shown_along_the_prescribed_motion() -> None:
     assert "Held-out data: force along the prescribed motion" in text
     assert "Strut force against the load cell, motion prescribed" in text
     assert "Height, free" not in text
-    assert "applied force as its only input" not in text
+    assert "the measured inputs alone" not in text
 
 
 def test_page_loads_nothing_and_forbids_it() -> None:
