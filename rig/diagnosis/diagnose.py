@@ -24,7 +24,7 @@ from rig.diagnosis.problem.problem import (
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.explore import FirstRound, explore
-from rig.diagnosis.search.fit import Fit, fit
+from rig.diagnosis.search.fit import WITH_MEMORY, Fit, fit
 from rig.diagnosis.search.model_selection import SearchResult, select_model
 from rig.diagnosis.search.pool import Pool, ValidatedModel
 from rig.diagnosis.search.surface import fit_surface
@@ -40,11 +40,9 @@ in pieces spread over them."""
 _EXPLAINED = ("nothing_missing", "explained", "ambiguous")
 """Verdicts where a model leaves noise alone."""
 
-_LIKE_A_GAIN = ("unmodelled_mode", "hysteresis")
-"""Families that were named for a wrong gain of 2 %: a mass of 2 % beside the body."""
 _MUCH_LESS = 0.5
 """Error of a model with gains over that of one without from which on it counts unless it explains:
-a gain of 3 % beside effects that were found in part made the error 27 times as large."""
+a gain of 3 %, where other effects were found in part, made the error 27 times as large."""
 
 
 class _Found(NamedTuple):
@@ -114,11 +112,11 @@ def _diagnose_problems(
 def _may_be_gains(found: _Found) -> bool:
     """Whether gains of heights may be what a model lacks, or stands in for.
 
-    They are what no law is, and are considered where none explains, or where those do that add to
-    the motion one of their own.
+    They are considered where no law explains, and where one with an internal state does: a further
+    mass of 2 % of the body was named for a gain that is wrong by 2 %.
     """
     families = {effect(name).family for _, name in found.search.chosen.fit.candidate.new}
-    return found.verdict not in _EXPLAINED or not families.isdisjoint(_LIKE_A_GAIN)
+    return found.verdict not in _EXPLAINED or not families.isdisjoint(WITH_MEMORY)
 
 
 def _is_better(other: _Found, found: _Found) -> bool:

@@ -311,17 +311,17 @@ def _linear_effects(
     after: Sequence[ResidualForces | None],
     channels: Sequence[ChannelCorrection],
 ) -> tuple[FoundEffect, ...]:
-    """Delays as effects, and where nothing else was found, all linear corrections."""
+    """Delays and gains as effects, and where nothing else was found, all linear corrections."""
     result = estimates.fit
-    late = {(item.channel, item.parameter) for item in channels if item.is_wrong}
+    wrong = {(item.channel, item.parameter) for item in channels if item.is_wrong}
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)
     implied = _find_preload_of_springs(problem, estimates)
     for variable, (index, p) in enumerate(zip(indices, _free(problem, result), strict=True)):
         if p.channel:
-            is_effect = (p.channel, PARAMETERS[p.kind]) in late
+            is_effect = (p.channel, PARAMETERS[p.kind]) in wrong
         else:
-            is_alone = not (result.candidate.new or late)
+            is_alone = not (result.candidate.new or wrong)
             is_effect = is_alone and p.kind in EFFECTS and variable not in implied
         if not is_effect:
             continue
@@ -543,7 +543,7 @@ def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
 
 
 def _notes_of_channels(channels: Sequence[ChannelCorrection]) -> tuple[str, ...]:
-    """What to do about a late channel."""
+    """What to do about a late channel, or one with a wrong gain."""
     notes: list[str] = []
     for item in channels:
         if not item.is_wrong:

@@ -1,4 +1,4 @@
-"""Delays of a recording's channels against its reference, as parameters of a fit.
+"""Delays and gains of a recording's channels against its reference, as parameters of a fit.
 
 A channel that is late shows at a time what was true the delay before. The reference of a driven
 bench is its first input, that of a prescribed motion the height of the load cell's own strut: a
@@ -108,6 +108,15 @@ def delays_of(
             else:
                 delays.inputs[parameter.input] = change
     return delays
+
+
+def gains_of(parameters: Sequence[LinearParameter], changes: Array, struts: int) -> Array:
+    """Gain of each strut's height by linear parameters with their changes, shape (struts,)."""
+    gains = np.ones(struts)
+    for parameter, change in zip(parameters, changes, strict=True):
+        if parameter.kind == "height_gain":
+            gains[parameter.strut] += change
+    return gains
 
 
 def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array) -> Array:

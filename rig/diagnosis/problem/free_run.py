@@ -29,6 +29,7 @@ from rig.diagnosis.problem.channel_delays import (
     Delays,
     LateReader,
     delays_of,
+    gains_of,
     height_gains,
     known_share,
     late_columns,
@@ -202,11 +203,7 @@ class FreeRunProblem(Problem):
 
     def _gains(self, model: CandidateModel) -> Array:
         """Gain of each strut's measured height, shape (struts,)."""
-        gains = np.ones(len(self.noise_m))
-        for parameter, change in zip(self.linear, model.parts.linear, strict=True):
-            if parameter.kind == "height_gain":
-                gains[parameter.strut] += change
-        return gains
+        return gains_of(self.linear, model.parts.linear, len(self.noise_m))
 
     def _seen(self, k: int, model: CandidateModel, motion: Trajectory) -> Array:
         """Heights of a simulated motion as the sensors show them, shape (N, struts)."""

@@ -61,7 +61,7 @@ USUAL = Effort(15)
 """Fits for which nothing else is given."""
 _NEAR = 0.2
 """Share of the range of a delay that is searched without any law: a standard deviation."""
-_WITH_MEMORY = {"hysteresis", "unmodelled_mode"}
+WITH_MEMORY = {"hysteresis", "unmodelled_mode"}
 """Families whose force follows the motion later, as that of a late channel does."""
 _LAGS = 20
 """Lags of the whiteness test."""
@@ -166,7 +166,7 @@ def _bounds(parameter: LinearParameter, candidate: Candidate) -> tuple[float, fl
     if parameter.kind != "delay":
         return parameter.least, parameter.most
     families = {effect(name).family for _, name in candidate.new}
-    if not families.isdisjoint(_WITH_MEMORY):
+    if not families.isdisjoint(WITH_MEMORY):
         return -LONGEST_S, LONGEST_S
     share = 1.0 if families or is_undetermined(parameter) else _NEAR
     low, middle, high = parameter.least, parameter.expected, parameter.most

@@ -39,6 +39,9 @@ _AS_EFFECT = {
     "input_gain": "input_gain",
 }
 
+_OF_CHANNELS = {"delay_s": "delay", "gain": "input_gain"}
+"""Effects that stand for corrections of channels."""
+
 BLOCKS = "blocks of the recordings, spread over them, were held out"
 
 
@@ -47,10 +50,6 @@ def join_words(items: Sequence[str], last: str) -> str:
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
-
-
-_OF_CHANNELS = {"delay_s": "delay", "gain": "input_gain"}
-"""Effects that stand for corrections of channels."""
 
 
 def missing(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
