@@ -1,7 +1,10 @@
 """What a model that runs in step with a bench must be able to do, whatever simulates it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dart_model.virtual_sensors import VirtualSensor
 
@@ -54,6 +57,21 @@ class LoadedModel(Protocol[StateT_co]):
 LoadedT = TypeVar("LoadedT", bound=LoadedModel[ModelState])
 
 
+class MotionGains(NamedTuple):
+    """How sensors of motions change: positions and angles as given, rates by rates.
+
+    Attributes:
+        by_heights: By the heights of some struts, shape (sensors, struts); NaN where they do not
+            determine a sensor, and of sensors of forces.
+        by_motions: By each moved body while these heights stay, shape (sensors, motions).
+        directly: By each moved body while the free coordinates stay, shape (sensors, motions).
+    """
+
+    by_heights: NDArray[np.float64]
+    by_motions: NDArray[np.float64]
+    directly: NDArray[np.float64]
+
+
 LoadedT_contra = TypeVar("LoadedT_contra", bound=LoadedModel[ModelState], contravariant=True)
 
 
@@ -66,6 +84,15 @@ class SensorReader(Protocol[LoadedT_contra]):
 
     def force_gains(self, loaded: LoadedT_contra) -> list[list[float]]:
         """Change of each sensor by a newton in each strut, shape (sensors, struts)."""
+        ...
+
+    @property
+    def has_constant_gains(self) -> bool:
+        """Whether the gains are the same in every state."""
+        ...
+
+    def motion_gains(self, loaded: LoadedT_contra, struts: Sequence[int]) -> MotionGains:
+        """Change of sensors of motions by the heights of some struts, and by each moved body."""
         ...
 
 

@@ -5,7 +5,7 @@ under a tyre, the acceleration at a seat, the force in a joint.
 """
 
 from types import MappingProxyType
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -21,76 +21,95 @@ class SensedQuantity(NamedTuple):
         dimension: What it measures, in SI.
         suffix: End of its column in the log: the quantity and its unit.
         meaning: For the guide.
-        by_force: Whether the forces of the struts change it at once, so that it is known as well as
-            they are.
+        known_by: What its standard deviation follows from: the ``force`` of the struts, which
+            changes it at once, or the ``height`` or the ``rate`` of those whose height is measured;
+            empty where it has none.
     """
 
     of: str
     dimension: Dimension
     suffix: str
     meaning: str
-    by_force: bool = False
+    known_by: Literal["", "force", "height", "rate"] = ""
 
 
 KINDS = MappingProxyType({
     "position_of": SensedQuantity(
-        "body", Dimension.LENGTH, "position_m", "position of a point of a body along an axis"
+        "body",
+        Dimension.LENGTH,
+        "position_m",
+        "position of a point of a body along an axis",
+        known_by="height",
     ),
     "velocity_of": SensedQuantity(
-        "body", Dimension.VELOCITY, "velocity_m_per_s", "velocity of such a point"
+        "body",
+        Dimension.VELOCITY,
+        "velocity_m_per_s",
+        "velocity of such a point",
+        known_by="rate",
     ),
     "acceleration_of": SensedQuantity(
         "body",
         Dimension.ACCELERATION,
         "acceleration_m_per_s2",
         "acceleration of such a point; an accelerometer there shows gravity in addition",
-        by_force=True,
+        known_by="force",
     ),
     "angle_of": SensedQuantity(
-        "body", Dimension.ANGLE, "angle_rad", "angle by which a body is turned about an axis"
+        "body",
+        Dimension.ANGLE,
+        "angle_rad",
+        "angle by which a body is turned about an axis",
+        known_by="height",
     ),
     "rate_of": SensedQuantity(
         "body",
         Dimension.ANGULAR_VELOCITY,
         "rate_rad_per_s",
         "angular velocity of a body about an axis",
+        known_by="rate",
     ),
     "coordinate_of": SensedQuantity(
         "joint",
         Dimension.LENGTH,
         "coordinate_m",
         "coordinate of a joint with one: in m, or in rad of one that turns",
+        known_by="height",
     ),
     "speed_of": SensedQuantity(
-        "joint", Dimension.VELOCITY, "speed_m_per_s", "rate of such a coordinate"
+        "joint",
+        Dimension.VELOCITY,
+        "speed_m_per_s",
+        "rate of such a coordinate",
+        known_by="rate",
     ),
     "reaction_of": SensedQuantity(
         "joint",
         Dimension.FORCE,
         "reaction_n",
         "force along an axis that a joint exerts on its child body",
-        by_force=True,
+        known_by="force",
     ),
     "torque_of": SensedQuantity(
         "joint",
         Dimension.TORQUE,
         "torque_n_m",
         "torque about an axis through the joint that it exerts on its child body",
-        by_force=True,
+        known_by="force",
     ),
     "force_of": SensedQuantity(
         "strut",
         Dimension.FORCE,
         "force_n",
         "force of a strut, as it is published of it",
-        by_force=True,
+        known_by="force",
     ),
     "power_of": SensedQuantity(
         "strut",
         Dimension.POWER,
         "power_w",
         "power that a strut takes from its bodies",
-        by_force=True,
+        known_by="force",
     ),
     "energy_of": SensedQuantity(
         "strut",
@@ -102,8 +121,8 @@ KINDS = MappingProxyType({
 """Keys of a virtual sensor, of which each has one."""
 
 _TURNING = {
-    "coordinate_of": SensedQuantity("joint", Dimension.ANGLE, "coordinate_rad", ""),
-    "speed_of": SensedQuantity("joint", Dimension.ANGULAR_VELOCITY, "speed_rad_per_s", ""),
+    "coordinate_of": SensedQuantity("joint", Dimension.ANGLE, "coordinate_rad", "", "height"),
+    "speed_of": SensedQuantity("joint", Dimension.ANGULAR_VELOCITY, "speed_rad_per_s", "", "rate"),
 }
 """The same of a joint that turns."""
 

@@ -24,6 +24,7 @@ from dart_model.errors import ModelError
 from dart_model.plant.geometry import Geometry
 from dart_model.plant.skeleton import Skeleton, build
 from dart_model.plant.state import Loaded
+from dart_model.protocol import MotionGains
 from dart_model.spec import WORLD, ModelSpec
 from dart_model.virtual_sensors import VirtualSensor
 
@@ -32,6 +33,9 @@ Array = NDArray[np.float64]
 _TURNING = "RevoluteJoint"
 _AFFINE = 1e-9
 """Largest difference from an affine reading that is rounding, relative."""
+_DETERMINED = 1e-6
+"""Share of a sensor's derivative that is rounding, and of the largest singular value below which
+heights depend on one another."""
 
 
 class _Instant(NamedTuple):
@@ -83,6 +87,7 @@ class VirtualSensors:
         self._gravity = np.array([0.0, 0.0, -spec.gravity_m_per_s2])
         self._reads_joints = any(it.kind in ("reaction_of", "torque_of") for it in sensors.values())
         self._readers = [self._reader(name, sensor) for name, sensor in sensors.items()]
+        self._derivatives = [self._derivative(sensor) for sensor in sensors.values()]
         self.affine = self._find_affine()
         """Readings by positions, rates, accelerations, strut forces, inputs, more force in
         parallel with the struts, and one; None where a sensor is curved."""
@@ -132,6 +137,34 @@ class VirtualSensors:
             changed = zip(self.read(loaded, more), first, strict=True)
             columns.append([after - before for after, before in changed])
         return [list(row) for row in zip(*columns, strict=True)]
+
+    @property
+    def has_constant_gains(self) -> bool:
+        """Whether the gains are the same in every state."""
+        return self.affine is not None
+
+    def motion_gains(self, loaded: Loaded, struts: Sequence[int]) -> MotionGains:
+        """Change of sensors of motions by the heights of some struts, and by each moved body.
+
+        Where joints turn, it is that of `loaded`.
+        """
+        q, inputs = np.array(loaded.state.positions), self._skeleton.inputs
+        seen = self._geometry.at(q).struts[list(struts)]
+        if self._skeleton.loops is not None:
+            seen = np.concatenate([seen, self._skeleton.loops.jacobian(q)])
+        self._dart.setPositions(q)
+        rows = np.array([derivative() for derivative in self._derivatives])
+        # One by one: the numbers of one sensor are the same whatever others there are.
+        inverse = np.linalg.pinv(seen[:, inputs.free], rcond=_DETERMINED)
+        gains = np.array([row @ inverse for row in rows[:, inputs.free]])
+        left = rows - np.array([row @ seen for row in gains])
+        rest, size = (np.linalg.norm(it[:, inputs.free], axis=1) for it in (left, rows))
+        gains[~(rest <= _DETERMINED * size)] = np.nan
+        by_heights = gains[:, : len(struts)]
+        if inputs.moved is None:
+            return MotionGains(by_heights, rows[:, :0], rows[:, :0])
+        moved, signs = inputs.moved.coordinates, inputs.moved.signs
+        return MotionGains(by_heights, left[:, moved] * signs, rows[:, moved] * signs)
 
     def _read(self, q: Array, v: Array, a: Array, forces_n: Array, inputs: Array) -> list[float]:
         dart = self._dart
@@ -266,6 +299,24 @@ class VirtualSensors:
         coordinate = self._dart.getDof(joint.getIndexInSkeleton(0))
         read = coordinate.getVelocity if is_rate else coordinate.getPosition
         return lambda _: float(read())
+
+    def _derivative(self, sensor: VirtualSensor) -> Callable[[], Array]:
+        """What gives the derivative of a sensor of a motion by the coordinates, shape (n,)."""
+        axis = np.array(sensor.axis) / np.linalg.norm(sensor.axis)
+        unknown = np.full(self._skeleton.coordinates, np.nan)
+        match sensor.kind:
+            case "position_of" | "velocity_of":
+                body, at = self._bodies[sensor.target], np.array(sensor.at)
+                return lambda: axis @ self._dart.getLinearJacobian(body, at)
+            case "angle_of" | "rate_of":
+                body = self._bodies[sensor.target]
+                return lambda: axis @ self._dart.getAngularJacobian(body)
+            case "coordinate_of" | "speed_of":
+                own = np.zeros_like(unknown)
+                own[self._joints[sensor.target].getIndexInSkeleton(0)] = 1.0
+                return lambda: own
+            case _:
+                return lambda: unknown
 
     # --- what joints carry ------------------------------------------------------------------------
 

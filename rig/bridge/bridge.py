@@ -288,12 +288,10 @@ class Bridge:
         """What the virtual sensors remember, and the output with what they show."""
         if self._sensors is None or supervised.mode in _NO_MODEL or not output.struts:
             return None, output
-        estimator = self.supervisor.estimator
-        loaded = estimator.model_of(supervised.estimator)
-        if loaded is None and self._sensors.reads_model:
+        estimator, state = self.supervisor.estimator, supervised.estimator
+        if self._sensors.reads_model and estimator.model_of(state) is None:
             return None, output
-        covariance_n2 = partial(estimator.force_covariance_n2, supervised.estimator)
-        sensed, shown = self._sensors.read(sensed, t_ns, loaded, output.struts, covariance_n2)
+        sensed, shown = self._sensors.read(sensed, t_ns, estimator, state, output.struts)
         return sensed, replace(output, sensors=shown)
 
     def _reports(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dart_model.protocol import AnySensorReader
 from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.values import StepInput, StrutOutput
-from rig.observers.protocol import AnyObserver
+from rig.observers.protocol import AnyObserver, Innovation
 
 StateT = TypeVar("StateT")
 
@@ -98,6 +98,21 @@ class Estimator(Protocol[StateT]):
 
     def force_covariance_n2(self, state: StateT) -> NDArray[np.float64]:
         """Covariance of the errors of the struts' forces, (struts, struts); NaN if not known."""
+        ...
+
+    def innovations(self, state: StateT) -> Sequence[Innovation | None]:
+        """Innovations of the newest heights by strut, and of the newest position of each motion.
+
+        They are None where there is none, or all are missing: where the model has just started.
+        """
+        ...
+
+    def motion_noise(self, state: StateT) -> NDArray[np.float64]:
+        """Noise of each motion, shape (motions, 4).
+
+        That of its samples (m²) and the time between two (s), and the variances by it of position
+        (m²) and velocity (m²/s²).
+        """
         ...
 
     def with_settings(

@@ -23,7 +23,7 @@ from rig.closed_loop.strut_response import laws_by_motion, linearise
 from rig.observers.error_model import StrutResponse
 from rig.observers.protocol import AnyObserver, Innovation, Start
 from rig.observers.strut_observers import ObserversState, StrutObservers
-from rig.observers.strut_sensors import Instant, model_height_m, model_reading
+from rig.observers.strut_sensors import Instant, model_height_m, model_motion_m, model_reading
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
         input_errors: Of each motion among the inputs the covariances of the laws' forces by the
             noise of its samples and by its lag, one after the other, over the mean squares of these
             as of `MeasuredInput.squares_m2`, N²/m², shape (2 * motions, struts * struts).
+        innovations: Of each strut that of a height at the last step; empty after a start.
     """
 
     t_ns: int
@@ -66,6 +67,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
     input_errors: Array = np.zeros((0, 0))
+    innovations: tuple[Innovation | None, ...] = ()
 
 
 _Received = Sequence[Sample | None]
@@ -148,10 +150,15 @@ class FreeModelEstimator:
             for channel in item.channels:
                 self._input_of[channel.index] = index
         ends = itertools.accumulate([len(item.values(None, 0)) for item in inputs], initial=0)
+        self._columns = [
+            (index, column)
+            for index, (item, column) in enumerate(zip(inputs, ends, strict=False))
+            if item.gains is not None
+        ]
         self._motions = tuple(
             (column, gains)
-            for item, column in zip(inputs, ends, strict=False)
-            if (gains := item.gains) is not None
+            for index, column in self._columns
+            if (gains := inputs[index].gains) is not None
         )
         self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
         self._silences_ns = [grace + stale_after_ns for grace in self._graces_ns]
@@ -342,6 +349,34 @@ class FreeModelEstimator:
             known += (np.array(squares_m2) @ state.input_errors).reshape(known.shape)
         return known
 
+    def innovations(self, state: FreeModelState) -> Sequence[Innovation | None]:
+        loaded = state.model
+        if loaded is None or not self._motions:
+            return state.innovations
+        found = list(state.innovations or (None,) * self.struts)
+        now = Instant(state.t_ns, loaded.state.struts, (), loaded.inputs)
+        instants = now, *state.past
+        for index, column in self._columns:
+            newest = self._inputs[index].newest(state.inputs[index])
+            innovation = None
+            if newest is not None:
+                value = newest.value - model_motion_m(newest.t_ns, column, instants)
+                innovation = Innovation(value, newest.t_ns)
+            found.append(innovation)
+        return found
+
+    def motion_noise(self, state: FreeModelState) -> Array:
+        rows: list[Array] = []
+        for index, _ in self._columns:
+            item = self._inputs[index]
+            gains = item.gains
+            if gains is not None:
+                sample_m2, _ = item.squares_m2(state.inputs[index])
+                interval_s = 1e-9 * item.channels[0].interval_ns
+                noise = sample_m2 * gains.noise.diagonal()
+                rows.append(np.array([sample_m2, interval_s, *noise]))
+        return np.reshape(rows, (-1, 4))
+
     def _start_of_strut(
         self, strut: int, samples: Sequence[Sample], t_ns: int, response: StrutResponse
     ) -> Start:
@@ -413,7 +448,9 @@ class FreeModelEstimator:
             if readings:
                 no_forces = (0.0,) * self.struts
                 forces_n = self._plant.load(model, no_forces, inputs, temperature_c).forces_n
-            instants = self._recent_instants(state, loaded, Instant(t_ns, model.struts, forces_n))
+            instants = self._recent_instants(
+                state, loaded, Instant(t_ns, model.struts, forces_n, inputs)
+            )
             further = self._compare(readings, instants)
         innovations: list[Innovation | None] = []
         bands: list[InnovationBand] = []
@@ -467,6 +504,7 @@ class FreeModelEstimator:
             state.longest_gaps_ns,
             tuple(bands),
             state.input_errors,
+            tuple(innovations),
         )
         return self._estimate(after, loaded, virtual_n, oldest_ns)
 
@@ -497,7 +535,8 @@ class FreeModelEstimator:
         """The model now and before, as far back as a measurement may be old."""
         oldest_ns = now.t_ns - self._oldest_ns
         kept = [now]
-        for instant in (Instant(state.t_ns, before.state.struts, before.forces_n), *state.past):
+        last = Instant(state.t_ns, before.state.struts, before.forces_n, before.inputs)
+        for instant in (last, *state.past):
             if kept[-1].t_ns <= oldest_ns:
                 break
             kept.append(instant)

@@ -69,6 +69,10 @@ class MeasuredInput(Protocol[StateT]):
         """Gains of the errors of a motion that is followed; None of any other input."""
         ...
 
+    def newest(self, state: StateT | None) -> Sample | None:
+        """The newest position of a motion; None of any other input, and before the first one."""
+        ...
+
     def squares_m2(self, state: StateT | None) -> tuple[float, ...]:
         """Variance of a followed motion's samples, and mean square of what lag adds to innovations.
 
@@ -105,6 +109,9 @@ class HeldInput:
     @property
     def gains(self) -> None:
         return None
+
+    def newest(self, state: Sample | None) -> None:
+        del state
 
     def squares_m2(self, state: Sample | None) -> tuple[()]:
         del state
@@ -154,7 +161,7 @@ class MovedInput:
             return state and replace(state, motion=accelerate(state.motion, sample))
         interval_ns = self.position.interval_ns
         if state is None or sample.t_ns - state.t_ns > _LONGEST_GAP * interval_ns:
-            first = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
+            first = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns, sample.value)
             if state is None:
                 return Followed(first, sample.t_ns)
             return replace(state, motion=first, since_ns=sample.t_ns)
@@ -185,6 +192,12 @@ class MovedInput:
             self.position.interval_ns * 1e-9,
             has_acceleration=self.acceleration is not None,
         )
+
+    def newest(self, state: Followed | None) -> Sample | None:
+        if state is None:
+            return None
+        motion = state.motion
+        return Sample(self.position.index, motion.measured_m, motion.measured_ns)
 
     def squares_m2(self, state: Followed | None) -> tuple[float, float]:
         if state is None:

@@ -172,6 +172,14 @@ class PrescribedMotionEstimator:
         del state
         return np.full((self.struts, self.struts), np.nan)
 
+    def innovations(self, state: PrescribedMotionState) -> tuple[()]:
+        del state
+        return ()
+
+    def motion_noise(self, state: PrescribedMotionState) -> NDArray[np.float64]:
+        del state
+        return np.zeros((0, 4))
+
     def step(
         self, state: PrescribedMotionState, step_input: StepInput
     ) -> tuple[PrescribedMotionState, Estimate | None]:

@@ -23,13 +23,17 @@ SETTLED = 9.0
 
 
 class TrackedMotion(Struct, frozen=True, gc=False):
-    """A motion as it is known: a position and its derivatives at the last measurement."""
+    """A motion as it is known: a position and its derivatives at the last measurement.
+
+    That measured `measured_m`.
+    """
 
     position_m: float
     velocity_m_per_s: float
     acceleration_m_per_s2: float
     innovation_m: float
     measured_ns: int
+    measured_m: float = 0.0
 
 
 def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
@@ -75,6 +79,7 @@ def _correct(
         acceleration + of_acceleration * innovation_m / (age_s * age_s),
         innovation_m,
         sample.t_ns,
+        sample.value,
     )
 
 

@@ -70,8 +70,8 @@ class LinearLoop(NamedTuple):
     d: Array
     interval_s: float
 
-    def noise_gain_n_per_m(self) -> float:
-        """Standard deviation of the force's error over that of a white sensor noise."""
+    def noise_covariance(self) -> Array:
+        """Covariance of x by white noise of unit variance, (n, n); NaN if the loop is unstable."""
         # Sum over all past samples: the discrete Lyapunov equation, by doubling.
         power, covariance = self.a, np.outer(self.b[:, 0], self.b[:, 0])
         for _ in range(60):
@@ -79,8 +79,12 @@ class LinearLoop(NamedTuple):
             covariance = covariance + added
             power = power @ power
             if np.abs(added).max(initial=0.0) <= 1e-14 * np.abs(covariance).max(initial=0.0):
-                break
-        variance = float(self.c @ covariance @ self.c) + float(self.d[0]) ** 2
+                return covariance
+        return np.full_like(covariance, np.nan)
+
+    def noise_gain_n_per_m(self) -> float:
+        """Standard deviation of the force's error over that of a white sensor noise."""
+        variance = float(self.c @ self.noise_covariance() @ self.c) + float(self.d[0]) ** 2
         return variance**0.5 if np.isfinite(variance) and variance >= 0.0 else float("inf")
 
     def lag_gain(self, frequency_hz: Array) -> Array:

@@ -24,11 +24,13 @@ class Instant(NamedTuple):
     Attributes:
         struts: Height (m) and velocity (m/s) of each strut.
         forces_n: Force of each strut's law; empty where no sensor requires it.
+        inputs: Input vector, as of `dart_model.protocol.LoadedModel`.
     """
 
     t_ns: int
     struts: Sequence[tuple[float, float]]
     forces_n: Sequence[float]
+    inputs: Sequence[float] = ()
 
 
 class StrutErrors(NamedTuple):
@@ -103,18 +105,31 @@ def model_height_m(measured_ns: int, strut: int, instants: Sequence[Instant]) ->
     of the tick before would seem to be an error of the model, and make fast loops unstable.) Before
     the oldest tick it is first order. `instants` has the newest tick first.
     """
+    return _position_m(measured_ns, instants, lambda instant: instant.struts[strut])
+
+
+def model_motion_m(measured_ns: int, column: int, instants: Sequence[Instant]) -> float:
+    """Position of a body that is moved, at a column of the inputs: as `model_height_m`."""
+    return _position_m(measured_ns, instants, lambda instant: instant.inputs[column : column + 2])
+
+
+_Motion = Callable[[Instant], Sequence[float]]
+"""Instant -> position (m) and velocity (m/s)."""
+
+
+def _position_m(t_ns: int, instants: Sequence[Instant], motion: _Motion) -> float:
     after = instants[0]
     for before in instants[1:]:
-        if before.t_ns <= measured_ns:
-            return _between(measured_ns, strut, before, after)
+        if before.t_ns <= t_ns:
+            return _between(t_ns, before, after, motion)
         after = before
-    height_m, velocity_m_per_s = after.struts[strut]
-    return height_m - velocity_m_per_s * (after.t_ns - measured_ns) * 1e-9
+    position_m, velocity_m_per_s = motion(after)
+    return position_m - velocity_m_per_s * (after.t_ns - t_ns) * 1e-9
 
 
-def _between(t_ns: int, strut: int, before: Instant, after: Instant) -> float:
-    """The cubic through the heights and velocities at two ticks (Hermite)."""
-    (low_m, low_rate), (high_m, high_rate) = before.struts[strut], after.struts[strut]
+def _between(t_ns: int, before: Instant, after: Instant, motion: _Motion) -> float:
+    """The cubic through positions and velocities at two ticks (Hermite)."""
+    (low_m, low_rate), (high_m, high_rate) = motion(before), motion(after)
     step_ns = after.t_ns - before.t_ns
     share = (t_ns - before.t_ns) / step_ns
     rest = 1.0 - share

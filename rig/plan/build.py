@@ -1,12 +1,14 @@
 """The bridge that a plan describes, and the model in it."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
+from typing import cast
 
 from can_dbc.database import Message
 from can_dbc.errors import InputError, expected_name
 from dart_model.plant import DartPlant, PrescribedStrut
-from dart_model.protocol import AnyPlant
+from dart_model.protocol import AnyPlant, AnySensorReader
 from dart_model.spec import ModelSpec
 from rig.bridge.bridge import Bridge
 from rig.bridge.estimator import AnyEstimator
@@ -14,14 +16,17 @@ from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
 from rig.bridge.incoming_messages import Alarm, Incoming, compile_incoming
 from rig.bridge.measured_inputs import AnyInput, HeldInput, MovedInput
 from rig.bridge.mode_supervisor import Supervisor
+from rig.bridge.motion_errors import MotionErrorTracker, block_length_ns
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
-from rig.bridge.virtual_sensors import VirtualSensors
+from rig.bridge.virtual_sensors import SensorPlace, VirtualSensors, is_of_motion
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
+from rig.closed_loop.noise_response import motion_by_noise
 from rig.closed_loop.settling import settling_times_ns
-from rig.observers.protocol import AnyObserver
+from rig.closed_loop.strut_response import linearise_at
+from rig.observers.protocol import AnyObserver, AnyTunableObserver
 from rig.plan.plan import Plan, PlannedInput
 from rig.plan.virtual_sensors import make_reader
 
@@ -59,7 +64,38 @@ def _virtual_sensors(plan: Plan, estimator: AnyEstimator) -> VirtualSensors | No
         return None
     of_model = {item.name: item.sensor for item in sensors if item.strut < 0}
     reader = make_reader(estimator.read_model, of_model, plan.source) if of_model else None
-    return VirtualSensors([item.place for item in sensors], reader)
+    places = [item.place for item in sensors]
+    tracker = None if reader is None else _motion_errors(plan, places, reader)
+    return VirtualSensors(places, reader, tracker)
+
+
+def _motion_errors(
+    plan: Plan, places: Sequence[SensorPlace], reader: AnySensorReader
+) -> MotionErrorTracker | None:
+    """What tracks the errors of sensors of motions; None where nothing shows them."""
+    of_model = [item for item in places if item.strut < 0]
+    sensors = [index for index, item in enumerate(of_model) if is_of_motion(item)]
+    struts = [strut for strut, item in enumerate(plan.observers) if item.requires_height]
+    if not sensors or not struts:
+        return None
+    plant, rest_m = build_plant(plan), [strut.free_length_m for strut in plan.struts]
+    responses = linearise_at(plant, rest_m).responses()
+    corners_per_s = [
+        2.0 * math.pi * cast("AnyTunableObserver", observer).bandwidth_hz(response.mobility_per_kg)
+        for observer, response in zip(plan.observers, responses, strict=True)
+        if observer.estimates_force
+    ]
+    block_ns = block_length_ns(corners_per_s, [plan.struts[strut].interval_ns for strut in struts])
+    motions = sum(item.is_motion for item in plan.inputs)
+    return MotionErrorTracker(
+        reader,
+        sensors,
+        struts,
+        [*struts, *range(len(plan.struts), len(plan.struts) + motions)],
+        [of_model[index].known_by == "rate" for index in sensors],
+        block_ns,
+        motion_by_noise(plant, plan.observers, rest_m, sample_timing(plan), struts),
+    )
 
 
 def build_plant(plan: Plan) -> AnyPlant:

@@ -31,13 +31,13 @@ class PlannedSensor:
     @property
     def place(self) -> SensorPlace:
         """What it reads, for the bridge."""
-        return SensorPlace(self.sensor.kind, self.strut, self.quantity.by_force)
+        return SensorPlace(self.sensor.kind, self.strut, self.quantity.known_by)
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns in the log of its value, and of the standard deviation where there is one."""
         column = f"{self.name}.{self.quantity.suffix}"
-        if not self.quantity.by_force:
+        if not self.quantity.known_by:
             return (column,)
         stem, _, unit = self.quantity.suffix.partition("_")
         return column, f"{self.name}.{stem}_std_{unit}"

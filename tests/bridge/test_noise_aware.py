@@ -14,6 +14,7 @@ from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
 from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.closed_loop.loop import Loop, SampleTiming
+from rig.closed_loop.noise_response import motion_by_noise
 from rig.closed_loop.poles import closed_loop_poles
 from rig.closed_loop.strut_response import linearise_at
 from rig.observers.error_filter import ErrorFilter
@@ -22,7 +23,7 @@ from rig.observers.pi import PiObserver
 from rig.plan.config import CONFIGS
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.trajectory import simulate
-from tests.bridge.cores import MS, bench_sample, channels, supervised
+from tests.bridge.cores import MS, bench_sample, channels, gains, supervised
 
 SUPERVISION = Supervision(stale_after_s=0.03, safe_after_s=0.5)
 PAPER = PiObserver(force_limit_n=5000.0)
@@ -162,6 +163,28 @@ def test_noise_and_lag_of_the_linear_loop_are_those_of_the_simulated_one(observe
         errors.append(error_n)
     amplitude = np.sqrt(2.0) * np.std(errors[-1000:])
     assert linear.lag_gain(np.array([frequency_hz]))[0] == pytest.approx(amplitude, rel=0.02)
+
+
+@pytest.mark.parametrize("kinds", ["kalman", "pi", "joint"])
+def test_a_model_moves_by_noise_as_stated(kinds):
+    """Covariance of heights and rates against the loop's own steps under noise."""
+    name, heights = (
+        ("quarter_car", [0.29, 0.35]) if kinds == "joint" else ("reference", [0.5 - 98.1 / 500.0])
+    )
+    plant = DartPlant(load_model(MODELS / f"{name}.yaml"))
+    kalman = KalmanObserver("kalman", ErrorFilter(12.0, 2e-5))
+    observers = [gains(1e5, 1e4)] if kinds == "pi" else [kalman] * len(heights)
+    timing, struts = SampleTiming(MS), range(len(heights))
+    stated = motion_by_noise(plant, observers, heights, timing, struts)
+    loop, rng, found = Loop(plant, observers, heights, timing), np.random.default_rng(5), []
+    x = loop.at_rest
+    for _ in range(12_000):
+        x, _ = loop.after(x, (2e-5 * rng.standard_normal(len(heights))).tolist())
+        found.append(plant.state_of(x[: loop._ends[1]].tolist()).struts)
+    simulated = np.var(np.array(found)[2000:], axis=0).T
+    assert stated.shape == (len(heights), 2, len(heights), len(heights))
+    expected = 4e-10 * np.diagonal(stated, axis1=2, axis2=3).sum(axis=0)
+    assert np.sqrt(expected) == pytest.approx(np.sqrt(simulated), rel=0.2)
 
 
 def test_a_start_from_several_heights_is_a_parabola_through_them():

@@ -276,6 +276,25 @@ def test_a_pivot_carries_what_its_arm_and_the_joint_of_the_loop_need():
     assert shown == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
+def test_a_closed_chain_has_the_gains_of_its_minimal_coordinate():
+    """Derivatives of an upright's place by the strut, of a mechanism with one coordinate."""
+    mechanism = double_wishbone()
+    plant = plant_of(mechanism.content)
+    sensors = {
+        "up": VirtualSensor(position_of="upright"),
+        "arm": VirtualSensor(coordinate_of="lower_joint"),
+    }
+    reader = plant.virtual_sensors(sensors)
+    for angle in (-0.1, 0.05):
+        heights = [mechanism.strut_m(angle + change) for change in (0.0, -1e-5, 1e-5)]
+        here, low, high = (
+            plant.load(plant.init([m]), (0.0,), (0.0,) * plant.inputs, 20.0) for m in heights
+        )
+        change = np.array(reader.read(high, (0.0,))) - np.array(reader.read(low, (0.0,)))
+        gains = reader.motion_gains(here, (0,)).by_heights[:, 0]
+        assert gains == pytest.approx(change / (heights[2] - heights[1]), rel=1e-5)
+
+
 # --- files ----------------------------------------------------------------------------------------
 
 _LINK = """<link name="{name}"><pose>0 {y} {z} 0 0 0</pose><inertial><mass>{mass}</mass><inertia>

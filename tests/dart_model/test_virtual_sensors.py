@@ -156,6 +156,59 @@ def test_a_newton_in_a_strut_changes_what_it_accelerates():
     np.testing.assert_allclose(gains, expected, atol=1e-9)
 
 
+def test_gains_of_a_motion_are_its_slopes_along_what_moves(pendulum):
+    """Where the only joint turns, by differences of two places."""
+    sensors = {
+        "x": VirtualSensor(position_of="rod", at=(0.0, 0.0, -LENGTH), axis=(1, 0, 0)),
+        "vz": VirtualSensor(velocity_of="rod", at=(0.0, 0.0, -LENGTH)),
+        "angle": VirtualSensor(angle_of="rod", axis=(0, 1, 0)),
+        "q": VirtualSensor(coordinate_of="pivot"),
+        "rz": VirtualSensor(reaction_of="pivot"),
+    }
+    reader = pendulum.virtual_sensors(sensors)
+    assert not reader.has_constant_gains
+    for angle in (-0.9, 0.2, 0.8):
+        loaded = pendulum.load(pendulum.state((angle,), (0.0,), (), 0.0), (0.0,), (0.0,), 20.0)
+        gains, by_motions, directly = reader.motion_gains(loaded, (0,))
+        assert by_motions.shape == directly.shape == (5, 0)
+        ends = [
+            pendulum.load(pendulum.state((q,), (0.0,), (), 0.0), (0.0,), (0.0,), 20.0)
+            for q in (angle - 1e-5, angle + 1e-5)
+        ]
+        low, high = (np.array(reader.read(end, (0.0,))) for end in ends)
+        height = ends[1].state.struts[0][0] - ends[0].state.struts[0][0]
+        by_height = (high - low) / height
+        assert gains[[0, 2, 3], 0] == pytest.approx(by_height[[0, 2, 3]], rel=1e-6)
+        # A velocity changes by the strut's rate as the point's place by its height.
+        assert gains[1, 0] == pytest.approx(LENGTH * math.sin(angle) * by_height[3], rel=1e-6)
+        assert math.isnan(gains[4, 0])
+
+
+def test_gains_of_guides_are_sums_of_heights_and_of_the_road():
+    """The road carries the tyre, the tyre the wheel, the wheel the suspension, that the body."""
+    plant = DartPlant(load_model(MODELS / "quarter_car_road.yaml"))
+    sensors = {
+        "body": VirtualSensor(position_of="body"),
+        "hub": VirtualSensor(velocity_of="wheel"),
+        "load": VirtualSensor(acceleration_of="wheel"),
+    }
+    reader = plant.virtual_sensors(sensors)
+    names = [strut.name for strut in plant.spec.struts]
+    tyre, suspension = names.index("tyre"), names.index("suspension")
+    heights = [strut.free_length_m for strut in plant.spec.struts]
+    loaded = plant.load(plant.init(heights), (0.0,) * 2, (0.0,) * plant.inputs, 20.0)
+    assert reader.has_constant_gains
+    gains, by_road, directly = reader.motion_gains(loaded, (tyre, suspension))
+    np.testing.assert_allclose(gains[:2], [[1.0, 1.0], [1.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(by_road[:2], [[1.0], [1.0]], atol=1e-9)
+    np.testing.assert_allclose(directly[:2], [[0.0], [0.0]], atol=1e-9)
+    assert np.isnan(gains[2]).all()
+    # Without the suspension's height the wheel is known, and the body is not.
+    gains = reader.motion_gains(loaded, (tyre,)).by_heights
+    assert math.isnan(gains[0, 0])
+    assert gains[1, 0] == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [

@@ -23,6 +23,7 @@ from rig.plan.preflight_checks import Severity, check
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.trajectory import simulate
 
 SENSORS = {
     "seat": {"acceleration_of": "body", "axis": [0, 0, 1]},
@@ -31,6 +32,9 @@ SENSORS = {
     "power": {"power_of": "suspension"},
     "heat": {"energy_of": "suspension"},
 }
+
+KALMAN = {"kind": "kalman", "filter": {"bandwidth_hz": 18, "noise_std_m": 5.0e-6}}
+PI = {"kind": "pi", "proportional_n_per_m": 4.0e5, "integral_n_per_m_s": 4.0e4}
 
 OWN_MESSAGE = """
 BO_ 901 SIM_2: 8 RIG
@@ -90,6 +94,39 @@ def test_the_log_has_a_column_of_each_that_belongs_to_the_others(ended):
     np.testing.assert_allclose(run["power.power_w"][known], power_w[known])
     sums = np.concatenate([[0.0], np.cumsum(0.5e-3 * (power_w[known][1:] + power_w[known][:-1]))])
     np.testing.assert_allclose(run["heat.energy_j"][known], sums, atol=1e-6)
+
+
+def test_a_position_is_as_close_to_the_bench_as_its_deviation_says(ended):
+    """The hub against the equations of the bench."""
+    run = open_run(ended[1].folder)
+    bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
+    truth = simulate(bench, round(3e9), 500_000)
+    up_m = np.interp(run.t_s, truth.t_ns * 1e-9, truth.height_m[:, :2].sum(axis=1))
+    counts = run.t_s > 1.5
+    std_m = run["hub.position_std_m"][counts]
+    missed = np.abs(run["hub.position_m"] - up_m)[counts]
+    assert np.mean(missed < 1.96 * std_m) > 0.93
+    assert np.sqrt(np.mean(std_m**2)) < 3.0 * np.sqrt(np.mean(missed**2))
+
+
+@pytest.mark.parametrize(
+    ("suspension", "tyre", "is_known"), [("pi", "pi", True), ("kalman", "none", False)]
+)
+def test_a_position_has_a_deviation_where_heights_determine_it(
+    tmp_path, suspension, tyre, is_known
+):
+    """Whatever the observers are; the height of a tyre that none of them uses is not compared."""
+    given = {"kalman": KALMAN, "pi": PI, "none": {"kind": "none"}}
+    observers = {"tyre": {**given[tyre]}, "suspension": {**given[suspension]}}
+    plan = load_plan(config(tmp_path, observers=observers), duration_s=0.5)
+    bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
+    run = open_run(with_bench(plan, bench, tmp_path / "run", lockstep=True).folder)
+    assert np.isfinite(run["hub.position_m"]).mean() > 0.9
+    assert (
+        np.isfinite(run["hub.position_std_m"]).mean() > 0.8
+        if is_known
+        else np.isnan(run["hub.position_std_m"]).all()
+    )
 
 
 def test_the_bus_has_what_the_log_has(ended):

@@ -1,0 +1,258 @@
+"""How far a model's motion is from that of its bench, as the innovations show it.
+
+The heights, and the positions of measured motions, are compared with the model before an observer
+uses them, so that their noise is independent of the model's error: what the innovations vary by
+beyond the noise is that error, whatever causes it (the observers' lag, or laws of other struts that
+are wrong).
+
+In blocks about as long as the observers' time constant, a straight line through the innovations of
+each channel shows the errors of position and rate, and what is left of it the noise. Each virtual
+sensor of a motion errs by these errors times its gains. Its variance is their mean square over the
+last blocks less that of the noise, or the fading square of an error that occurs now and then, and
+what the observers follow of the noise, which is in the model and not in the innovations.
+
+Reference: Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE TAC 15
+(1970), for innovations that show what a filter lacks.
+"""
+
+import math
+from collections.abc import Sequence
+from operator import mul
+from typing import Any, NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from dart_model.protocol import AnySensorReader
+from rig.bridge.estimator import AnyEstimator
+from rig.observers.protocol import Innovation
+
+Array = NDArray[np.float64]
+
+_AVERAGED = 64
+"""Blocks over which squares are averaged: about a second of an observer with 20 Hz."""
+
+_LARGEST_OF_NORMAL = 9.0
+"""Square that normal errors hardly ever show, over its mean: three standard deviations."""
+
+_FEWEST = 4
+"""Innovations that a line and the noise about it are taken from."""
+
+_BLOCK_PER_CORNER, _BLOCK = 2.0, 16
+"""Length of a block over the reciprocal of the fastest corner, in which a line shows nine tenths of
+a swing at that corner; and in samples, where no observer has one."""
+
+_LONGEST = 16
+"""Blocks after which one is given up in which a channel has too few innovations."""
+
+Innovations = tuple[Sequence[Innovation | None], ...]
+"""Of each tick of a block those of all channels."""
+
+
+class MotionErrors(Struct, frozen=True, gc=False):
+    """What the blocks have shown so far, of c channels (heights, then motions) and k sensors.
+
+    Attributes:
+        begin_ns: Time at which the present block began.
+        end_ns: Time at which it is over.
+        blocks: Number of blocks so far.
+        noise_m2: Variance of each channel's noise, shape (c,).
+        square: Mean square of what the lines show of each sensor, shape (k,).
+        white: Share of the noise in it, shape (k,).
+        peak: Fading peak of that square, shape (k,).
+        stds: Standard deviation of each sensor; NaN before the first block, and where the heights
+            do not determine the sensor.
+    """
+
+    begin_ns: int
+    end_ns: int
+    blocks: int
+    noise_m2: Array
+    square: Array
+    white: Array
+    peak: Array
+    stds: list[float]
+
+
+class ErrorGains(NamedTuple):
+    """How k sensors err by c channels.
+
+    Attributes:
+        shown: Error by that of each channel, shape (k, c).
+        squares: Their squares.
+        by_noise: Variance by that of the noise of each of h heights that the model follows, (k, h).
+        by_motions: Variance by that of each motion over a block, shape (k, motions).
+        directly: The same by what is faster, which moves the moved body alone.
+    """
+
+    shown: Array
+    squares: Array
+    by_noise: Array
+    by_motions: Array
+    directly: Array
+
+
+class TrackedErrors(Struct, frozen=True, gc=False):
+    """State of the errors of sensors of motions.
+
+    Attributes:
+        errors: What the blocks have shown.
+        gains: How each sensor errs, where the last block ended.
+        pending: Innovations of the present block.
+    """
+
+    errors: MotionErrors
+    gains: ErrorGains
+    pending: Innovations
+
+
+def block_length_ns(corners_per_s: Sequence[float], intervals_ns: Sequence[int]) -> int:
+    """Length of a block for observers with some corners, and channels at some intervals."""
+    longest_ns = max(intervals_ns)
+    if not corners_per_s:
+        return _BLOCK * longest_ns
+    return max(round(_BLOCK_PER_CORNER * 1e9 / max(corners_per_s)), _FEWEST * longest_ns)
+
+
+class MotionErrorTracker:
+    """Tracks the errors of virtual sensors of motions.
+
+    Args:
+        reader: Reads the sensors of a model.
+        sensors: Places of those of motions among them.
+        struts: Indices of the struts whose heights are compared.
+        channels: Places of their innovations and of those of motions among all innovations.
+        is_rate: Of each sensor whether it reads a velocity, shape (k,).
+        block_ns: Length of a block.
+        by_noise: Motion of the struts by the noise of their heights, as of
+            `rig.closed_loop.noise_response`.
+    """
+
+    def __init__(
+        self,
+        reader: AnySensorReader,
+        sensors: Sequence[int],
+        struts: Sequence[int],
+        channels: Sequence[int],
+        is_rate: Sequence[bool],
+        block_ns: int,
+        by_noise: Array,
+    ) -> None:
+        self._reader, self._sensors = reader, list(sensors)
+        self._struts = tuple(struts)
+        self._channels = tuple(channels)
+        self._order = np.array(is_rate, dtype=np.intp)
+        self._block_ns = block_ns
+        self._by_noise = by_noise
+
+    def init(self, t_ns: int, loaded: Any) -> TrackedErrors:
+        """State at the start of a model."""
+        sensors, noise_m2 = np.zeros(len(self._order)), np.zeros(len(self._channels))
+        stds, end_ns = [math.nan] * len(sensors), t_ns + self._block_ns
+        errors = MotionErrors(t_ns, end_ns, 0, noise_m2, sensors, sensors, sensors, stds)
+        return TrackedErrors(errors, self._find_gains(loaded), ())
+
+    def update(
+        self, tracked: TrackedErrors, t_ns: int, estimator: AnyEstimator, state: Any
+    ) -> TrackedErrors:
+        """State after a tick behind which an estimator has a state."""
+        errors, gains = tracked.errors, tracked.gains
+        pending = (*tracked.pending, estimator.innovations(state))
+        if t_ns < errors.end_ns:
+            return TrackedErrors(errors, gains, pending)
+        errors = self.conclude(errors, pending, t_ns, gains, estimator.motion_noise(state))
+        if not self._reader.has_constant_gains:
+            gains = self._find_gains(estimator.model_of(state))
+        return TrackedErrors(errors, gains, () if errors.begin_ns == t_ns else pending)
+
+    def _find_gains(self, loaded: Any) -> ErrorGains:
+        """How the sensors err where the model is."""
+        every = self._reader.motion_gains(loaded, self._struts)
+        by_heights, by_motions, directly = (of_all[self._sensors] for of_all in every)
+        shown = np.concatenate([by_heights, by_motions], axis=1)
+        # One by one: the numbers of one sensor are the same whatever others there are.
+        by_noise = np.array(
+            [
+                [row @ of_channel @ row for of_channel in self._by_noise[:, order]]
+                for row, order in zip(by_heights, self._order, strict=True)
+            ]
+        )
+        return ErrorGains(shown, shown**2, by_noise, by_motions**2, directly**2)
+
+    def conclude(
+        self,
+        errors: MotionErrors,
+        innovations: Innovations,
+        t_ns: int,
+        gains: ErrorGains,
+        motion_noise: Array,
+    ) -> MotionErrors:
+        """State at the end of a block with some innovations, and its standard deviations.
+
+        `motion_noise` is as of `Estimator.motion_noise`. The block begins where it did if a channel
+        has too few of them.
+        """
+        lines = [self._line(channel, innovations, errors.begin_ns) for channel in self._channels]
+        n, spread, mean, slope, left = np.array(lines).T
+        if n.min() < _FEWEST:
+            return self._prolong(errors, t_ns)
+        order = self._order
+        blocks = errors.blocks + 1
+        # The first blocks are those of the start, and fade as fast as others come.
+        share = max(1.0 / _AVERAGED, 2.0 / (blocks + 1.0))
+        noise_m2 = errors.noise_m2 + share * (left - errors.noise_m2)
+        # Of positions and of rates.
+        shown, by_noise = np.array([mean, slope]), np.array([noise_m2 / n, noise_m2 / spread])
+        new = (gains.shown * shown[order]).sum(axis=1) ** 2
+        of_noise = (gains.squares * by_noise[order]).sum(axis=1)
+        square = errors.square + share * (new - errors.square)
+        white = errors.white + share * (of_noise - errors.white)
+        peak = np.maximum(new, (1.0 - share) * errors.peak)
+        beyond = np.maximum(square - white, peak - _LARGEST_OF_NORMAL * square)
+        variance = np.maximum(beyond, 0.0)
+        variance += (gains.by_noise * noise_m2[: len(self._struts)]).sum(axis=1)
+        if len(motion_noise):
+            block_s = 1e-9 * (t_ns - errors.begin_ns)
+            variance += self._of_motions(gains, motion_noise, block_s)
+        end_ns, stds = t_ns + self._block_ns, np.sqrt(variance).tolist()
+        return MotionErrors(t_ns, end_ns, blocks, noise_m2, square, white, peak, stds)
+
+    def _line(
+        self, channel: int, innovations: Innovations, begin_ns: int
+    ) -> tuple[float, float, float, float, float]:
+        """The line through a channel's innovations in a block.
+
+        The result is their number, the sum of squares of their times about the mean (s²), their
+        mean (m), the slope (m/s) and the variance about it (m²); no number where they are too few.
+        """
+        found = {new.t_ns: new.value for each in innovations if each and (new := each[channel])}
+        n = len(found)
+        if n < _FEWEST:
+            return 0.0, 1.0, 0.0, 0.0, 0.0
+        at = [1e-9 * (t_ns - begin_ns) for t_ns in found]
+        values = list(found.values())
+        mean_s, mean = sum(at) / n, sum(values) / n
+        spread = sum([t * t for t in at]) - n * mean_s * mean_s
+        slope = (sum(map(mul, at, values)) - n * mean_s * mean) / spread
+        left = sum([value * value for value in values]) - n * mean * mean - slope * slope * spread
+        return float(n), spread, mean, slope, max(left, 0.0) / (n - 2.0)
+
+    def _prolong(self, errors: MotionErrors, t_ns: int) -> MotionErrors:
+        """State whose block goes on, or begins anew where it has gone on for too long."""
+        is_long = t_ns - errors.begin_ns > _LONGEST * self._block_ns
+        begin_ns = t_ns if is_long else errors.begin_ns
+        return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns)
+
+    def _of_motions(self, gains: ErrorGains, motion_noise: Array, block_s: float) -> Array:
+        """Variance of each sensor by the noise of the motions, shape (k,).
+
+        All that hangs on a moved body follows it as far as the noise lasts for a block, as that of
+        a line through its samples does; what is faster has no time to move anything else.
+        """
+        samples_m2, intervals_s, *variances = motion_noise.T
+        line = samples_m2 * intervals_s / block_s * np.array([[1.0], [12.0 / block_s**2]])
+        slow = np.minimum(variances, line)
+        fast = (np.array(variances) - slow)[self._order]
+        return (gains.by_motions * slow[self._order] + gains.directly * fast).sum(axis=1)
