@@ -30,7 +30,7 @@ from rig.closed_loop.strut_response import (
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan, PlannedInput, vital_channels
-from rig.plan.virtual_sensors import make_reader
+from rig.plan.virtual_sensors import PlannedSensor, make_reader
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
@@ -138,15 +138,21 @@ def _virtual_sensors(plan: Plan, plant: AnyPlant) -> list[Finding]:
         is_corrected = corrected.get(item.name, False)
         if item.strut >= 0:
             is_corrected = item.strut in observed
-        text = (
-            "the measured heights correct it"
-            if is_corrected
-            else "no measured height corrects it, or not all of it: it is that of the model alone"
-        )
+        text = "no measured height corrects it, or not all of it: it is that of the model alone"
+        if is_corrected:
+            text = "the measured heights correct it"
+            if item.quantity.known_by == "force" and not _knows_forces(plan, item, observed):
+                text += "; its standard deviation would be known with observers of kind kalman"
         what = f"virtual sensor {item.name}"
         severity = Severity.OK if is_corrected else Severity.WARNING
         findings.append(Finding(severity, what, text))
     return findings
+
+
+def _knows_forces(plan: Plan, item: PlannedSensor, observed: Sequence[int]) -> bool:
+    """Whether the standard deviations of the forces are known that a sensor depends on."""
+    on = [item.strut] if item.strut >= 0 else observed
+    return all(plan.struts[strut].observer.knows_std for strut in on)
 
 
 def errors(plan: Plan) -> list[Finding]:
