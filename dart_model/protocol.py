@@ -64,7 +64,8 @@ class MotionGains(NamedTuple):
         by_heights: By the heights of some struts, shape (sensors, struts); NaN where they do not
             determine a sensor, and of sensors of forces.
         by_motions: By each moved body while these heights stay, shape (sensors, motions).
-        directly: By each moved body while the free coordinates stay, shape (sensors, motions).
+        directly: By each moved body that moves too fast for all else, which stays by its inertia,
+            shape (sensors, motions).
     """
 
     by_heights: NDArray[np.float64]

@@ -148,23 +148,26 @@ class VirtualSensors:
 
         Where joints turn, it is that of `loaded`.
         """
-        q, inputs = np.array(loaded.state.positions), self._skeleton.inputs
-        seen = self._geometry.at(q).struts[list(struts)]
-        if self._skeleton.loops is not None:
-            seen = np.concatenate([seen, self._skeleton.loops.jacobian(q)])
+        q, free, loops = np.array(loaded.state.positions), self._skeleton.free, self._skeleton.loops
+        spread = np.eye(len(q)) if loops is None else loops.spread(q)
+        seen = self._geometry.at(q).struts[list(struts)] @ spread
         self._dart.setPositions(q)
-        rows = np.array([derivative() for derivative in self._derivatives])
+        mass = spread.T @ np.array(self._dart.getMassMatrix()) @ spread
         # One by one: the numbers of one sensor are the same whatever others there are.
-        inverse = np.linalg.pinv(seen[:, inputs.free], rcond=_DETERMINED)
-        gains = np.array([row @ inverse for row in rows[:, inputs.free]])
-        left = rows - np.array([row @ seen for row in gains])
-        rest, size = (np.linalg.norm(it[:, inputs.free], axis=1) for it in (left, rows))
-        gains[~(rest <= _DETERMINED * size)] = np.nan
-        by_heights = gains[:, : len(struts)]
-        if inputs.moved is None:
+        rows = np.array([derivative() @ spread for derivative in self._derivatives])
+        inverse = np.linalg.pinv(seen[:, free], rcond=_DETERMINED)
+        by_heights = np.array([row @ inverse for row in rows[:, free]])
+        left = rows - np.array([row @ seen for row in by_heights])
+        rest, size = (np.linalg.norm(it[:, free], axis=1) for it in (left, rows))
+        by_heights[~(rest <= _DETERMINED * size)] = np.nan
+        moved = self._skeleton.inputs.moved
+        if moved is None:
             return MotionGains(by_heights, rows[:, :0], rows[:, :0])
-        moved, signs = inputs.moved.coordinates, inputs.moved.signs
-        return MotionGains(by_heights, left[:, moved] * signs, rows[:, moved] * signs)
+        at = moved.coordinates
+        # What is free stays where it is by its inertia.
+        jolt = np.linalg.solve(mass[np.ix_(free, free)], mass[np.ix_(free, at)])
+        directly = rows[:, at] - np.array([row @ jolt for row in rows[:, free]])
+        return MotionGains(by_heights, left[:, at] * moved.signs, directly * moved.signs)
 
     def _read(self, q: Array, v: Array, a: Array, forces_n: Array, inputs: Array) -> list[float]:
         dart = self._dart

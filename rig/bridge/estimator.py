@@ -8,7 +8,7 @@ An estimator knows no modes: when its estimate is published, and as what, is dec
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -18,6 +18,25 @@ from dart_model.protocol import AnySensorReader
 from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.values import StepInput, StrutOutput
 from rig.observers.protocol import AnyObserver, Innovation
+
+
+class FollowedError(NamedTuple):
+    """What is known of the error of a motion that is followed, at a tick.
+
+    Attributes:
+        sample_m2: Variance of its samples' noise.
+        noise: Variances of position (m²) and velocity (m²/s²) by it, shape (2,).
+        lag: Mean squares of both by the filter's lag, shape (2,).
+        interval_s: Time between two samples.
+        delay_s: Time that a sample is old when it comes.
+    """
+
+    sample_m2: float
+    noise: NDArray[np.float64]
+    lag: NDArray[np.float64]
+    interval_s: float
+    delay_s: float
+
 
 StateT = TypeVar("StateT")
 
@@ -107,12 +126,8 @@ class Estimator(Protocol[StateT]):
         """
         ...
 
-    def motion_noise(self, state: StateT) -> NDArray[np.float64]:
-        """Noise of each motion, shape (motions, 4).
-
-        That of its samples (m²) and the time between two (s), and the variances by it of position
-        (m²) and velocity (m²/s²).
-        """
+    def motion_errors(self, state: StateT) -> Sequence[FollowedError]:
+        """What is known of the error of each motion that is followed."""
         ...
 
     def with_settings(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, AnySensorReader, LoadedModel, ModelState
 from dart_model.virtual_sensors import VirtualSensor
-from rig.bridge.estimator import Estimate, find_divergence, is_sensible
+from rig.bridge.estimator import Estimate, FollowedError, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measured_inputs import AnyInput, InputState, grace_ns
 from rig.bridge.measurement_age import is_too_old
@@ -150,16 +150,12 @@ class FreeModelEstimator:
             for channel in item.channels:
                 self._input_of[channel.index] = index
         ends = itertools.accumulate([len(item.values(None, 0)) for item in inputs], initial=0)
+        # Of each motion its place among the inputs, and its column in their vector.
         self._columns = [
             (index, column)
             for index, (item, column) in enumerate(zip(inputs, ends, strict=False))
             if item.gains is not None
         ]
-        self._motions = tuple(
-            (column, gains)
-            for index, column in self._columns
-            if (gains := inputs[index].gains) is not None
-        )
         self._graces_ns = [grace_ns(item, stale_after_ns) for item in inputs]
         self._silences_ns = [grace + stale_after_ns for grace in self._graces_ns]
 
@@ -321,17 +317,21 @@ class FreeModelEstimator:
     def _at_rest(self, inputs: Sequence[float]) -> tuple[float, ...]:
         """Inputs whose motions stand still where they are."""
         still = list(inputs)
-        for column, _ in self._motions:
+        for _, column in self._columns:
             still[column + 1 : column + 3] = 0.0, 0.0
         return tuple(still)
 
     def _input_errors(self, model: ModelState, inputs: Sequence[float]) -> Array:
         """Covariances of the laws' forces by errors of the motions, as of `FreeModelState`."""
         rows: list[Array] = []
-        for column, gains in self._motions:
-            slopes = laws_by_motion(self._plant, model, inputs, column)
-            late = slopes @ gains.lag
-            rows += [(slopes @ gains.noise @ slopes.T).ravel(), np.outer(late, late).ravel()]
+        for index, column in self._columns:
+            item = self._inputs[index]
+            gains = item.gains
+            if gains is not None:
+                slopes = laws_by_motion(self._plant, model, inputs, column)
+                noise, lag = gains.ahead(1e-9 * item.channels[0].delay_ns)
+                late = slopes @ lag
+                rows += [(slopes @ noise @ slopes.T).ravel(), np.outer(late, late).ravel()]
         return np.array(rows)
 
     def force_covariance_n2(self, state: FreeModelState) -> Array:
@@ -342,7 +342,7 @@ class FreeModelEstimator:
         unknown = [strut for strut, std_n in enumerate(stds_n) if math.isnan(std_n)]
         if unknown:
             known[unknown] = known[:, unknown] = np.nan
-        if self._motions:
+        if self._columns:
             squares_m2: list[float] = []
             for item, followed in zip(self._inputs, state.inputs, strict=True):
                 squares_m2 += item.squares_m2(followed)
@@ -351,7 +351,7 @@ class FreeModelEstimator:
 
     def innovations(self, state: FreeModelState) -> Sequence[Innovation | None]:
         loaded = state.model
-        if loaded is None or not self._motions:
+        if loaded is None or not self._columns:
             return state.innovations
         found = list(state.innovations or (None,) * self.struts)
         now = Instant(state.t_ns, loaded.state.struts, (), loaded.inputs)
@@ -365,17 +365,25 @@ class FreeModelEstimator:
             found.append(innovation)
         return found
 
-    def motion_noise(self, state: FreeModelState) -> Array:
-        rows: list[Array] = []
+    def motion_errors(self, state: FreeModelState) -> list[FollowedError]:
+        errors: list[FollowedError] = []
         for index, _ in self._columns:
             item = self._inputs[index]
-            gains = item.gains
+            gains, channel = item.gains, item.channels[0]
             if gains is not None:
-                sample_m2, _ = item.squares_m2(state.inputs[index])
-                interval_s = 1e-9 * item.channels[0].interval_ns
-                noise = sample_m2 * gains.noise.diagonal()
-                rows.append(np.array([sample_m2, interval_s, *noise]))
-        return np.reshape(rows, (-1, 4))
+                sample_m2, lag_m2 = item.squares_m2(state.inputs[index])
+                delay_s, interval_s = 1e-9 * channel.delay_ns, 1e-9 * channel.interval_ns
+                noise, lag = gains.ahead(delay_s)
+                errors.append(
+                    FollowedError(
+                        sample_m2,
+                        sample_m2 * noise.diagonal(),
+                        lag_m2 * lag**2,
+                        interval_s,
+                        delay_s,
+                    )
+                )
+        return errors
 
     def _start_of_strut(
         self, strut: int, samples: Sequence[Sample], t_ns: int, response: StrutResponse
@@ -573,7 +581,7 @@ class FreeModelEstimator:
         is_calm = state.is_settled
         t_ns, longest_gaps_ns, bands = state.t_ns, state.longest_gaps_ns, state.bands
         stds_n = [observer.force_std_n for observer in state.observers.struts]
-        if self._motions:
+        if self._columns:
             stds_n = np.sqrt(self.force_covariance_n2(state).diagonal()).tolist()
         for strut, observer in enumerate(state.observers.struts):
             if (

@@ -6,7 +6,8 @@ beyond the noise is that error, whatever causes it (the observers' lag, or laws 
 are wrong).
 
 In blocks about as long as the observers' time constant, a straight line through the innovations of
-each channel shows the errors of position and rate, and what is left of it the noise. Each virtual
+each channel shows the errors of position and rate, and their third differences, which a smooth
+error hardly has, show the noise. Each virtual
 sensor of a motion errs by these errors times its gains. Its variance is their mean square over the
 last blocks less that of the noise, or the fading square of an error that occurs now and then, and
 what the observers follow of the noise, which is in the model and not in the innovations.
@@ -26,7 +27,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dart_model.protocol import AnySensorReader
-from rig.bridge.estimator import AnyEstimator
+from rig.bridge.estimator import AnyEstimator, FollowedError
 from rig.observers.protocol import Innovation
 
 Array = NDArray[np.float64]
@@ -38,14 +39,18 @@ _LARGEST_OF_NORMAL = 9.0
 """Square that normal errors hardly ever show, over its mean: three standard deviations."""
 
 _FEWEST = 4
-"""Innovations that a line and the noise about it are taken from."""
+"""Innovations that a line and their noise are taken from."""
+
+_OF_THIRD_DIFFERENCES = 20.0
+"""Variance of third differences of white noise over its own: 1 + 9 + 9 + 1."""
 
 _BLOCK_PER_CORNER, _BLOCK = 2.0, 16
-"""Length of a block over the reciprocal of the fastest corner, in which a line shows nine tenths of
-a swing at that corner; and in samples, where no observer has one."""
+"""Length of a block over the reciprocal of the fastest corner, and in samples where no observer has
+one."""
 
-_LONGEST = 16
-"""Blocks after which one is given up in which a channel has too few innovations."""
+_UNKNOWN, _LONGEST = 2, 16
+"""Blocks after which nothing is known any more, and after which one is given up, in which a channel
+has too few innovations."""
 
 Innovations = tuple[Sequence[Innovation | None], ...]
 """Of each tick of a block those of all channels."""
@@ -108,12 +113,28 @@ class TrackedErrors(Struct, frozen=True, gc=False):
     pending: Innovations
 
 
-def block_length_ns(corners_per_s: Sequence[float], intervals_ns: Sequence[int]) -> int:
-    """Length of a block for observers with some corners, and channels at some intervals."""
+class Block(NamedTuple):
+    """Length of a block.
+
+    Attributes:
+        shown: Share of a swing at the observers' fastest corner that a line over it shows, of the
+            position and of the rate.
+    """
+
+    length_ns: int
+    shown: tuple[float, float] = (1.0, 1.0)
+
+
+def block_for(corners_per_s: Sequence[float], intervals_ns: Sequence[int]) -> Block:
+    """Block for observers with some corners, and channels at some intervals."""
     longest_ns = max(intervals_ns)
     if not corners_per_s:
-        return _BLOCK * longest_ns
-    return max(round(_BLOCK_PER_CORNER * 1e9 / max(corners_per_s)), _FEWEST * longest_ns)
+        return Block(_BLOCK * longest_ns)
+    corner_per_s = max(corners_per_s)
+    length_ns = max(round(_BLOCK_PER_CORNER * 1e9 / corner_per_s), (_FEWEST + 1) * longest_ns)
+    half = min(0.5e-9 * length_ns * corner_per_s, 0.5 * math.pi)
+    rate = 3.0 * (math.sin(half) - half * math.cos(half)) / half**3
+    return Block(length_ns, (math.sin(half) / half, rate))
 
 
 class MotionErrorTracker:
@@ -125,7 +146,7 @@ class MotionErrorTracker:
         struts: Indices of the struts whose heights are compared.
         channels: Places of their innovations and of those of motions among all innovations.
         is_rate: Of each sensor whether it reads a velocity, shape (k,).
-        block_ns: Length of a block.
+        block: Length of a block, and what a line over it shows.
         by_noise: Motion of the struts by the noise of their heights, as of
             `rig.closed_loop.noise_response`.
     """
@@ -137,14 +158,15 @@ class MotionErrorTracker:
         struts: Sequence[int],
         channels: Sequence[int],
         is_rate: Sequence[bool],
-        block_ns: int,
+        block: Block,
         by_noise: Array,
     ) -> None:
         self._reader, self._sensors = reader, list(sensors)
         self._struts = tuple(struts)
         self._channels = tuple(channels)
         self._order = np.array(is_rate, dtype=np.intp)
-        self._block_ns = block_ns
+        self._block_ns = block.length_ns
+        self._shown = np.square(block.shown)[self._order]
         self._by_noise = by_noise
 
     def init(self, t_ns: int, loaded: Any) -> TrackedErrors:
@@ -162,7 +184,7 @@ class MotionErrorTracker:
         pending = (*tracked.pending, estimator.innovations(state))
         if t_ns < errors.end_ns:
             return TrackedErrors(errors, gains, pending)
-        errors = self.conclude(errors, pending, t_ns, gains, estimator.motion_noise(state))
+        errors = self.conclude(errors, pending, t_ns, gains, estimator.motion_errors(state))
         if not self._reader.has_constant_gains:
             gains = self._find_gains(estimator.model_of(state))
         return TrackedErrors(errors, gains, () if errors.begin_ns == t_ns else pending)
@@ -175,10 +197,10 @@ class MotionErrorTracker:
         # One by one: the numbers of one sensor are the same whatever others there are.
         by_noise = np.array(
             [
-                [row @ of_channel @ row for of_channel in self._by_noise[:, order]]
+                [_variance(row, of_channel) for of_channel in self._by_noise[:, order]]
                 for row, order in zip(by_heights, self._order, strict=True)
             ]
-        )
+        ).reshape(len(by_heights), -1)
         return ErrorGains(shown, shown**2, by_noise, by_motions**2, directly**2)
 
     def conclude(
@@ -187,22 +209,21 @@ class MotionErrorTracker:
         innovations: Innovations,
         t_ns: int,
         gains: ErrorGains,
-        motion_noise: Array,
+        motions: Sequence[FollowedError],
     ) -> MotionErrors:
         """State at the end of a block with some innovations, and its standard deviations.
 
-        `motion_noise` is as of `Estimator.motion_noise`. The block begins where it did if a channel
-        has too few of them.
+        The block begins where it did if a channel has too few of them.
         """
         lines = [self._line(channel, innovations, errors.begin_ns) for channel in self._channels]
-        n, spread, mean, slope, left = np.array(lines).T
+        n, spread, mean, slope, new_m2 = np.array(lines).T
         if n.min() < _FEWEST:
             return self._prolong(errors, t_ns)
         order = self._order
         blocks = errors.blocks + 1
         # The first blocks are those of the start, and fade as fast as others come.
         share = max(1.0 / _AVERAGED, 2.0 / (blocks + 1.0))
-        noise_m2 = errors.noise_m2 + share * (left - errors.noise_m2)
+        noise_m2 = errors.noise_m2 + share * (new_m2 - errors.noise_m2)
         # Of positions and of rates.
         shown, by_noise = np.array([mean, slope]), np.array([noise_m2 / n, noise_m2 / spread])
         new = (gains.shown * shown[order]).sum(axis=1) ** 2
@@ -211,11 +232,11 @@ class MotionErrorTracker:
         white = errors.white + share * (of_noise - errors.white)
         peak = np.maximum(new, (1.0 - share) * errors.peak)
         beyond = np.maximum(square - white, peak - _LARGEST_OF_NORMAL * square)
-        variance = np.maximum(beyond, 0.0)
+        variance = np.maximum(beyond, 0.0) / self._shown
         variance += (gains.by_noise * noise_m2[: len(self._struts)]).sum(axis=1)
-        if len(motion_noise):
-            block_s = 1e-9 * (t_ns - errors.begin_ns)
-            variance += self._of_motions(gains, motion_noise, block_s)
+        block_s = 1e-9 * (t_ns - errors.begin_ns)
+        for place, motion in enumerate(motions):
+            variance += self._by_motion(gains, place, motion, block_s)
         end_ns, stds = t_ns + self._block_ns, np.sqrt(variance).tolist()
         return MotionErrors(t_ns, end_ns, blocks, noise_m2, square, white, peak, stds)
 
@@ -225,7 +246,8 @@ class MotionErrorTracker:
         """The line through a channel's innovations in a block.
 
         The result is their number, the sum of squares of their times about the mean (s²), their
-        mean (m), the slope (m/s) and the variance about it (m²); no number where they are too few.
+        mean (m), the slope (m/s) and the variance of their noise (m²); the number is zero where
+        they are too few.
         """
         found = {new.t_ns: new.value for each in innovations if each and (new := each[channel])}
         n = len(found)
@@ -236,23 +258,37 @@ class MotionErrorTracker:
         mean_s, mean = sum(at) / n, sum(values) / n
         spread = sum([t * t for t in at]) - n * mean_s * mean_s
         slope = (sum(map(mul, at, values)) - n * mean_s * mean) / spread
-        left = sum([value * value for value in values]) - n * mean * mean - slope * slope * spread
-        return float(n), spread, mean, slope, max(left, 0.0) / (n - 2.0)
+        differences = zip(values, values[1:], values[2:], values[3:], strict=False)
+        squares = sum([(d - a + 3.0 * (b - c)) ** 2 for a, b, c, d in differences])
+        return float(n), spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES
 
     def _prolong(self, errors: MotionErrors, t_ns: int) -> MotionErrors:
         """State whose block goes on, or begins anew where it has gone on for too long."""
-        is_long = t_ns - errors.begin_ns > _LONGEST * self._block_ns
-        begin_ns = t_ns if is_long else errors.begin_ns
-        return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns)
+        blocks = (t_ns - errors.begin_ns) / self._block_ns
+        begin_ns = t_ns if blocks > _LONGEST else errors.begin_ns
+        stds = [math.nan] * len(errors.stds) if blocks >= _UNKNOWN else errors.stds
+        return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns, stds=stds)
 
-    def _of_motions(self, gains: ErrorGains, motion_noise: Array, block_s: float) -> Array:
-        """Variance of each sensor by the noise of the motions, shape (k,).
+    def _by_motion(
+        self, gains: ErrorGains, place: int, motion: FollowedError, block_s: float
+    ) -> Array:
+        """Variance of each sensor by what a motion errs by and no innovation shows, shape (k,).
 
-        All that hangs on a moved body follows it as far as the noise lasts for a block, as that of
-        a line through its samples does; what is faster has no time to move anything else.
+        All that hangs on a moved body follows the noise as far as it lasts for a block, as that of
+        a parabola through the samples does; what is faster, and the lag, moves the moved body
+        alone.
         """
-        samples_m2, intervals_s, *variances = motion_noise.T
-        line = samples_m2 * intervals_s / block_s * np.array([[1.0], [12.0 / block_s**2]])
-        slow = np.minimum(variances, line)
-        fast = (np.array(variances) - slow)[self._order]
-        return (gains.by_motions * slow[self._order] + gains.directly * fast).sum(axis=1)
+        # Variances of position, rate and acceleration by a block's samples, and after the delay.
+        density, h = motion.sample_m2 * motion.interval_s / block_s, motion.delay_s
+        x, v, a = density, 12.0 * density / block_s**2, 720.0 * density / block_s**4
+        line = np.array([x + h * h * v + 0.25 * h**4 * a, v + h * h * a])
+        slow = np.minimum(motion.noise, line)
+        fast = motion.noise - slow + motion.lag
+        by_motion, directly = gains.by_motions[:, place], gains.directly[:, place]
+        return by_motion * slow[self._order] + directly * fast[self._order]
+
+
+def _variance(row: Array, covariance: Array) -> float:
+    """Variance of a sum; what it does not contain need not be known."""
+    used = np.flatnonzero(row)
+    return float(row[used] @ covariance[np.ix_(used, used)] @ row[used])

@@ -176,9 +176,9 @@ class PrescribedMotionEstimator:
         del state
         return ()
 
-    def motion_noise(self, state: PrescribedMotionState) -> NDArray[np.float64]:
+    def motion_errors(self, state: PrescribedMotionState) -> tuple[()]:
         del state
-        return np.zeros((0, 4))
+        return ()
 
     def step(
         self, state: PrescribedMotionState, step_input: StepInput

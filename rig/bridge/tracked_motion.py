@@ -104,12 +104,13 @@ class ErrorGains(NamedTuple):
     """Errors of a followed motion at the time of a sample, by what makes them.
 
     Attributes:
-        noise: Covariance of position (m) and velocity (m/s) by white noise of unit variance in the
-            samples, shape (2, 2).
+        noise: Covariance of position (m), velocity (m/s) and acceleration (m/s²) by white noise of
+            unit variance in the samples, shape (3, 3).
         innovation: Variance of the innovations by that noise.
         change: Variance of their changes from sample to sample by it.
-        lag: Errors of position and velocity per metre of innovation where the filter lags behind:
-            behind a constant jerk, or, with a measured acceleration, one with a constant error.
+        lag: Errors of the three, and of the jerk that is taken for zero, per metre of innovation
+            where the filter lags behind: behind a constant jerk, or, with a measured acceleration,
+            one with a constant error. Shape (4,).
     """
 
     noise: NDArray[np.float64]
@@ -117,12 +118,18 @@ class ErrorGains(NamedTuple):
     change: float
     lag: NDArray[np.float64]
 
+    def ahead(self, time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Noise (2, 2) and lag (2,) of position and velocity some time after the sample."""
+        h, h2, h3 = time_s, time_s**2 / 2.0, time_s**3 / 6.0
+        ahead = np.array([[1.0, h, h2, h3], [0.0, 1.0, h, h2]])
+        return ahead[:, :3] @ self.noise @ ahead[:, :3].T, ahead @ self.lag
+
 
 def error_gains(settling_s: float, interval_s: float, *, has_acceleration: bool) -> ErrorGains:
     """What noise of samples and lag do to a followed motion."""
     update = update_with_acceleration if has_acceleration else update_motion
     step_ns, power = round(interval_s * 1e9), 2 if has_acceleration else 3
-    noise, innovation, change, before_m = np.zeros((2, 2)), 0.0, 0.0, 0.0
+    noise, innovation, change, before_m = np.zeros((3, 3)), 0.0, 0.0, 0.0
     rest = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
     # The response to one sample, and to a power of time.
     passed, late = rest, rest
@@ -130,14 +137,15 @@ def error_gains(settling_s: float, interval_s: float, *, has_acceleration: bool)
         t_ns = number * step_ns
         passed = update(passed, Sample(0, float(number == 1), t_ns), settling_s)
         late = update(late, Sample(0, (t_ns * 1e-9) ** power, t_ns), settling_s)
-        now = np.array([passed.position_m, passed.velocity_m_per_s])
+        now = np.array([passed.position_m, passed.velocity_m_per_s, passed.acceleration_m_per_s2])
         noise += np.outer(now, now)
         innovation += passed.innovation_m**2
         change += (passed.innovation_m - before_m) ** 2
         before_m = passed.innovation_m
     t_s = late.measured_ns * 1e-9
-    truth = np.array([t_s**power, power * t_s ** (power - 1)])
-    lag = np.array([late.position_m, late.velocity_m_per_s]) - truth
+    derivatives = [math.perm(power, order) * t_s ** max(power - order, 0) for order in range(4)]
+    found = [late.position_m, late.velocity_m_per_s, late.acceleration_m_per_s2, 0.0]
+    lag = np.array(found) - derivatives
     return ErrorGains(noise, innovation, change, lag / late.innovation_m)
 
 

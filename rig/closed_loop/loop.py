@@ -75,9 +75,10 @@ class LinearLoop(NamedTuple):
         # Sum over all past samples: the discrete Lyapunov equation, by doubling.
         power, covariance = self.a, np.outer(self.b[:, 0], self.b[:, 0])
         for _ in range(60):
-            added = power @ covariance @ power.T
-            covariance = covariance + added
-            power = power @ power
+            with np.errstate(over="ignore", invalid="ignore"):
+                added = power @ covariance @ power.T
+                covariance = covariance + added
+                power = power @ power
             if np.abs(added).max(initial=0.0) <= 1e-14 * np.abs(covariance).max(initial=0.0):
                 return covariance
         return np.full_like(covariance, np.nan)

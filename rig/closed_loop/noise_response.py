@@ -46,4 +46,4 @@ def motion_by_noise(
         of_motion = shown @ covariance @ shown.T
         count = len(struts)
         found.append(np.array([of_motion[:count, :count], of_motion[count:, count:]]))
-    return np.array(found)
+    return np.reshape(found, (len(struts), 2, len(struts), len(struts)))

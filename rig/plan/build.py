@@ -16,7 +16,7 @@ from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
 from rig.bridge.incoming_messages import Alarm, Incoming, compile_incoming
 from rig.bridge.measured_inputs import AnyInput, HeldInput, MovedInput
 from rig.bridge.mode_supervisor import Supervisor
-from rig.bridge.motion_errors import MotionErrorTracker, block_length_ns
+from rig.bridge.motion_errors import MotionErrorTracker, block_for
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
 from rig.bridge.virtual_sensors import SensorPlace, VirtualSensors, is_of_motion
@@ -76,7 +76,8 @@ def _motion_errors(
     of_model = [item for item in places if item.strut < 0]
     sensors = [index for index, item in enumerate(of_model) if is_of_motion(item)]
     struts = [strut for strut, item in enumerate(plan.observers) if item.requires_height]
-    if not sensors or not struts:
+    motions = [item.channel for item in plan.inputs if item.is_motion and item.channel is not None]
+    if not sensors or not (struts or motions):
         return None
     plant, rest_m = build_plant(plan), [strut.free_length_m for strut in plan.struts]
     responses = linearise_at(plant, rest_m).responses()
@@ -85,15 +86,15 @@ def _motion_errors(
         for observer, response in zip(plan.observers, responses, strict=True)
         if observer.estimates_force
     ]
-    block_ns = block_length_ns(corners_per_s, [plan.struts[strut].interval_ns for strut in struts])
-    motions = sum(item.is_motion for item in plan.inputs)
+    intervals_ns = [plan.struts[strut].interval_ns for strut in struts]
+    intervals_ns += [channel.interval_ns for channel in motions]
     return MotionErrorTracker(
         reader,
         sensors,
         struts,
-        [*struts, *range(len(plan.struts), len(plan.struts) + motions)],
+        [*struts, *range(len(plan.struts), len(plan.struts) + len(motions))],
         [of_model[index].known_by == "rate" for index in sensors],
-        block_ns,
+        block_for(corners_per_s, intervals_ns),
         motion_by_noise(plant, plan.observers, rest_m, sample_timing(plan), struts),
     )
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dart_model.protocol import MotionGains
-from rig.bridge.motion_errors import MotionErrorTracker, block_length_ns
+from rig.bridge.estimator import FollowedError
+from rig.bridge.motion_errors import Block, MotionErrorTracker, block_for
 from rig.bridge.virtual_sensors import stds_by_force
 from rig.observers.protocol import Innovation
 
@@ -32,17 +33,16 @@ class Reader:
         return self.gains
 
 
-def track(values_m, reader=None, followed=NOTHING_FOLLOWED, channels=(0,), motion_noise=()):
+def track(values_m, reader=None, followed=NOTHING_FOLLOWED, channels=(0,), motion_errors=()):
     """Deviations of position and velocity after innovations at 1 kHz, (ticks, channels)."""
     reader = reader or Reader()
     tracker = MotionErrorTracker(
-        reader, (0, 1), (0,), channels, (False, True), BLOCK * MS, followed
+        reader, (0, 1), (0,), channels, (False, True), Block(BLOCK * MS), followed
     )
-    noise = np.reshape(motion_noise, (-1, 4))
     now = SimpleNamespace()
     estimator = SimpleNamespace(
         innovations=lambda _state: now.innovations,
-        motion_noise=lambda _state: noise,
+        motion_errors=lambda _state: motion_errors,
         model_of=lambda _state: None,
     )
     tracked = tracker.init(0, None)
@@ -102,15 +102,16 @@ def test_a_measured_motion_is_one_more_channel_and_its_own_noise():
     still = np.zeros((400, 2))
     hangs, stands = ([[1.0], [1.0]], [[0.0], [0.0]]), ([[1.0], [1.0]], [[1.0], [1.0]])
     # Samples of 10 um, an interval of 1 ms, and what the filter makes of them.
-    noise = [1e-10, 1e-3, 0.5e-10, 4e-6]
+    motion = FollowedError(1e-10, np.array([0.5e-10, 4e-6]), np.zeros(2), 1e-3, 0.0)
     slow = [1e-10 / BLOCK, 12.0 * 1e-10 / BLOCK**3 / 1e-6]
     for (by_motions, directly), expected in ((hangs, slow), (stands, [0.5e-10, 4e-6])):
         reader = Reader(by_motions=by_motions, directly=directly)
-        found = track(still, reader, channels=(0, 1), motion_noise=noise)
+        found = track(still, reader, channels=(0, 1), motion_errors=[motion])
         np.testing.assert_allclose(found, np.sqrt(expected), rtol=1e-9)
+    nothing = FollowedError(0.0, np.zeros(2), np.zeros(2), 1e-3, 0.0)
     both = np.column_stack([np.full(400, -1e-4), np.full(400, 2e-4)])
     assert track(both, Reader(by_motions=hangs[0], directly=hangs[1]), channels=(0, 1),
-                 motion_noise=[0.0, 1e-3, 0.0, 0.0])[0] == pytest.approx(0.0, abs=1e-12)  # fmt: skip
+                 motion_errors=[nothing])[0] == pytest.approx(0.0, abs=1e-12)  # fmt: skip
 
 
 def test_what_the_heights_do_not_determine_has_no_deviation():
@@ -132,9 +133,21 @@ def test_a_block_waits_for_the_slowest_channel_and_is_given_up_if_none_comes():
 
 
 def test_a_block_lasts_as_long_as_the_observers_take():
-    assert block_length_ns([50.0, 100.0], [MS]) == 20 * MS
-    assert block_length_ns([1e4], [MS, 5 * MS]) == 20 * MS
-    assert block_length_ns([], [2 * MS]) == 32 * MS
+    assert block_for([50.0, 100.0], [MS]).length_ns == 20 * MS
+    assert block_for([1e4], [MS, 5 * MS]).length_ns == 25 * MS
+    assert block_for([], [2 * MS]).length_ns == 32 * MS
+
+
+def test_a_line_shows_a_swing_at_the_corner_as_stated():
+    """The least-squares line through a sine, over all phases."""
+    corner_per_s = 2.0 * math.pi * 15.0
+    block = block_for([corner_per_s], [MS // 100])
+    t_s = np.linspace(0.0, 1e-9 * block.length_ns, 2001)
+    centred = t_s - t_s.mean()
+    swings = [np.sin(corner_per_s * t_s + phase) for phase in np.linspace(0.0, 6.28, 50)]
+    means = np.abs([swing.mean() for swing in swings]).max()
+    slopes = np.abs([swing @ centred / (centred @ centred) for swing in swings]).max()
+    assert (means, slopes / corner_per_s) == pytest.approx(block.shown, rel=2e-3)
 
 
 def test_a_sensor_needs_only_the_forces_that_it_depends_on():

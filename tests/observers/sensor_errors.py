@@ -16,7 +16,7 @@ import yaml
 
 from dart_model.virtual_sensors import VirtualSensor
 from rig.bridge.mode_supervisor import Supervision
-from rig.bridge.motion_errors import MotionErrorTracker, block_length_ns
+from rig.bridge.motion_errors import MotionErrorTracker, block_for
 from rig.bridge.values import StepInput
 from rig.bridge.virtual_sensors import SensorPlace, VirtualSensors
 from rig.channels.channel import Sample
@@ -266,13 +266,13 @@ def on_arm(bandwidth_hz, duration_s, seed):
         core = supervised(plant, (observer,), Supervision(), channels(1, interval_ns=period_ns))
         estimator = core.estimator
         struts, corners = ((), ()) if kind == "alone" else ((0,), (2.0 * math.pi * bandwidth_hz,))
-        block_ns = block_length_ns(corners, (period_ns,))
+        block = block_for(corners, (period_ns,))
         reader, tracker = estimator.read_model(read), None
         if struts:
             timing = SampleTiming.of(period_ns, period_ns, 0)
             by_noise = motion_by_noise(plant, (observer,), heights[0], timing, struts)
             of_motions = (0, 1), struts, struts, (False, True)
-            tracker = MotionErrorTracker(reader, *of_motions, block_ns, by_noise)
+            tracker = MotionErrorTracker(reader, *of_motions, block, by_noise)
         sensors = VirtualSensors(places, reader, tracker)
         state, sensed, values = core.init(0), None, np.full((len(t_s), 2 * len(read)), np.nan)
         for tick, (height, t) in enumerate(zip(heights[:, 0] + noise, t_s.tolist(), strict=True)):
