@@ -47,15 +47,15 @@ class SensedState(Struct, frozen=True, gc=False):
     """What is remembered between two ticks.
 
     Attributes:
-        gains: Change of each sensor of the model by a newton in each strut, where it started,
-            shape (sensors, struts).
+        products: Products of the changes of each sensor that forces change, by a newton in each
+            strut where the model started, as of `products_of`.
         tracked: Errors of the sensors of motions; None where there are none.
         powers_w: Power that each strut took.
         energies_j: Energy that each strut has taken since the model started.
     """
 
     t_ns: int
-    gains: Array
+    products: Array
     tracked: TrackedErrors | None
     powers_w: tuple[float, ...]
     energies_j: tuple[float, ...]
@@ -126,8 +126,8 @@ class VirtualSensors:
             known = self._reader.read(estimator.model_of(state), residual_n)
             by_force = self._no_stds_by_force
             # Not NaN: an observer knows it.
-            if by_force and any([strut.force_std_n == strut.force_std_n for strut in struts]):
-                by_force = stds_by_force(sensed.gains, estimator.force_covariance_n2(state))
+            if by_force and any(strut.force_std_n == strut.force_std_n for strut in struts):
+                by_force = stds_by_force(sensed.products, estimator.force_covariance_n2(state))
             tracked = sensed.tracked
             by_height = self._no_stds_by_height if tracked is None else tracked.errors.stds
             known = [*known, *by_force, *by_height]
@@ -161,28 +161,36 @@ class VirtualSensors:
         tracked = sensed.tracked
         if self._tracker is not None and tracked is not None:
             tracked = self._tracker.update(tracked, t_ns, estimator, state)
-        return SensedState(t_ns, sensed.gains, tracked, powers_w, energies_j)
+        return SensedState(t_ns, sensed.products, tracked, powers_w, energies_j)
 
     def _begin(self, t_ns: int, loaded: Any, powers_w: tuple[float, ...]) -> SensedState:
         """State at the first tick of a model."""
-        gains, tracked = np.zeros((0, 0)), None
+        products, tracked = np.zeros((0, 0)), None
         if self._reader is not None:
-            gains = np.array(self._reader.force_gains(loaded))[self._by_force]
+            products = products_of(np.array(self._reader.force_gains(loaded))[self._by_force])
         if self._tracker is not None:
             tracked = self._tracker.init(t_ns, loaded)
-        return SensedState(t_ns, gains, tracked, powers_w, (0.0,) * len(powers_w))
+        return SensedState(t_ns, products, tracked, powers_w, (0.0,) * len(powers_w))
 
 
-def stds_by_force(gains: Array, covariance_n2: Array) -> list[float]:
-    """Standard deviations of sensors by those of forces; NaN where they depend on one unknown."""
-    variances: Array = ((gains @ covariance_n2) * gains).sum(axis=1)
+def products_of(gains: Array) -> Array:
+    """Products of the gains of each sensor, shape (sensors, struts * struts)."""
+    return (gains[:, :, None] * gains[:, None, :]).reshape(len(gains), -1)
+
+
+def stds_by_force(products: Array, covariance_n2: Array) -> list[float]:
+    """Standard deviations of sensors by those of forces; NaN where they depend on one unknown.
+
+    `products` are those of the gains. What one sensor shows is the same bit for bit whatever others
+    there are, as a matrix product would not be.
+    """
+    each = covariance_n2.ravel()
+    variances: Array = (products * each).sum(axis=1)
     if np.isnan(variances).any():
-        unknown = np.isnan(np.diagonal(covariance_n2))
-        sizes = np.abs(gains)
-        depends = (sizes[:, unknown] > _NO_GAIN * sizes.max(axis=1)[:, None]).any(axis=1)
-        known_n2 = np.nan_to_num(covariance_n2)
-        variances = ((gains @ known_n2) * gains).sum(axis=1)
-        variances[depends] = np.nan
+        sizes = np.abs(products)
+        depends = sizes[:, np.isnan(each)] > _NO_GAIN * sizes.max(axis=1)[:, None]
+        variances = (products * np.nan_to_num(each)).sum(axis=1)
+        variances[depends.any(axis=1)] = np.nan
     return np.sqrt(variances).tolist()
 
 

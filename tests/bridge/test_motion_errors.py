@@ -9,7 +9,7 @@ import pytest
 from dart_model.protocol import MotionGains
 from rig.bridge.estimator import FollowedError
 from rig.bridge.motion_errors import Block, MotionErrorTracker, block_for
-from rig.bridge.virtual_sensors import stds_by_force
+from rig.bridge.virtual_sensors import products_of, stds_by_force
 from rig.observers.protocol import Innovation
 
 MS, BLOCK = 1_000_000, 20
@@ -153,7 +153,18 @@ def test_a_line_shows_a_swing_at_the_corner_as_stated():
 def test_a_sensor_needs_only_the_forces_that_it_depends_on():
     gains = np.array([[1.0, 0.0], [1.0, 2.0], [0.5, 1e-14]])
     covariance = np.array([[4.0, math.nan], [math.nan, math.nan]])
-    found = stds_by_force(gains, covariance)
+    found = stds_by_force(products_of(gains), covariance)
     assert found[0] == 2.0
     assert math.isnan(found[1])
     assert found[2] == 1.0
+
+
+def test_a_sensor_has_the_same_deviation_bit_for_bit_beside_others():
+    rng = np.random.default_rng(6)
+    for struts in (1, 2, 8):
+        root = rng.standard_normal((struts, struts))
+        gains, covariance = rng.standard_normal((12, struts)), root @ root.T
+        every = stds_by_force(products_of(gains), covariance)
+        for count in range(1, 12):
+            assert stds_by_force(products_of(gains[:count]), covariance) == every[:count]
+        assert every[0] == pytest.approx(math.sqrt(gains[0] @ covariance @ gains[0]))

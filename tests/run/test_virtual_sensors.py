@@ -160,6 +160,7 @@ def test_a_replay_is_the_same_and_adds_what_the_run_did_not_have(
     assert replay(folder).different == 0
     assert rig(monkeypatch, "replay", folder, "--add", "rate: {velocity_of: body}") == 0
     run = open_run(folder)
+    assert np.isfinite(run["rate.velocity_std_m_per_s"]).mean() > 0.9
     whole = run["suspension.velocity_m_per_s"] + run["tyre.velocity_m_per_s"]
     assert np.isfinite(run["rate.velocity_m_per_s"]).mean() > 0.99
     assert np.nanstd(run["rate.velocity_m_per_s"] - whole) < 1.0

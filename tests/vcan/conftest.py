@@ -118,8 +118,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
             "watchdog": False,
             "limits": [
                 {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
-                # Without a height for the half second until it is stale, the model swings from -0.2 m
-                # to 1.3 m, depending on where it was: beyond the range of the signal.
+                # Without a height for the half second until it is stale, the model swings from
+                # -0.2 m to 1.3 m, depending on where it was: beyond the range of the signal.
                 {"value": "height_m", "low": -2.0, "high": 3.0, "action": "safe"},
             ],
         }
