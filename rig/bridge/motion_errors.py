@@ -48,9 +48,8 @@ _BLOCK_PER_CORNER, _BLOCK = 2.0, 16
 """Length of a block over the reciprocal of the fastest corner, and in samples where no observer has
 one."""
 
-_UNKNOWN, _LONGEST = 2, 16
-"""Blocks after which nothing is known any more, and after which one is given up, in which a channel
-has too few innovations."""
+_LONGEST = 16
+"""Blocks after which one is given up in which a channel has too few innovations."""
 
 Innovations = tuple[Sequence[Innovation | None], ...]
 """Of each tick of a block those of all channels."""
@@ -218,7 +217,7 @@ class MotionErrorTracker:
         lines = [self._line(channel, innovations, errors.begin_ns) for channel in self._channels]
         n, spread, mean, slope, new_m2 = np.array(lines).T
         if n.min() < _FEWEST:
-            return self._prolong(errors, t_ns)
+            return self._prolong(errors, innovations, t_ns)
         order = self._order
         blocks = errors.blocks + 1
         # The first blocks are those of the start, and fade as fast as others come.
@@ -262,11 +261,16 @@ class MotionErrorTracker:
         squares = sum([(d - a + 3.0 * (b - c)) ** 2 for a, b, c, d in differences])
         return float(n), spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES
 
-    def _prolong(self, errors: MotionErrors, t_ns: int) -> MotionErrors:
-        """State whose block goes on, or begins anew where it has gone on for too long."""
-        blocks = (t_ns - errors.begin_ns) / self._block_ns
-        begin_ns = t_ns if blocks > _LONGEST else errors.begin_ns
-        stds = [math.nan] * len(errors.stds) if blocks >= _UNKNOWN else errors.stds
+    def _prolong(self, errors: MotionErrors, innovations: Innovations, t_ns: int) -> MotionErrors:
+        """State whose block goes on, or begins anew where it has gone on for too long.
+
+        Nothing is known any more where a channel has been silent for the length of a block.
+        """
+        passed_ns = t_ns - errors.begin_ns
+        begin_ns = t_ns if passed_ns > _LONGEST * self._block_ns else errors.begin_ns
+        silent = max([_silent_ticks(channel, innovations) for channel in self._channels])
+        is_unknown = silent * passed_ns >= self._block_ns * len(innovations)
+        stds = [math.nan] * len(errors.stds) if is_unknown else errors.stds
         return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns, stds=stds)
 
     def _by_motion(
@@ -286,6 +290,13 @@ class MotionErrorTracker:
         fast = motion.noise - slow + motion.lag
         by_motion, directly = gains.by_motions[:, place], gains.directly[:, place]
         return by_motion * slow[self._order] + directly * fast[self._order]
+
+
+def _silent_ticks(channel: int, innovations: Innovations) -> int:
+    """Ticks since the newest innovation of a channel came."""
+    times_ns = [new.t_ns if each and (new := each[channel]) else None for each in innovations]
+    known_ns = [t_ns for t_ns in times_ns if t_ns is not None]
+    return len(times_ns) - 1 - times_ns.index(max(known_ns)) if known_ns else len(times_ns)
 
 
 def _variance(row: Array, covariance: Array) -> float:

@@ -124,12 +124,20 @@ def test_what_the_heights_do_not_determine_has_no_deviation():
     assert np.isnan(track(np.full(1000, math.nan))).all()
 
 
-def test_a_block_waits_for_the_slowest_channel_and_is_given_up_if_none_comes():
+def test_a_block_waits_for_the_slowest_channel():
     rare = np.full(400, math.nan)
     rare[::10] = 3e-4
     assert track(rare)[0] == pytest.approx(6e-4)
-    missing = np.concatenate([np.full(100, 1e-2), np.full(400, math.nan), np.full(3000, 1e-4)])
-    assert track(missing)[0] < 5e-3
+
+
+def test_nothing_is_known_while_a_channel_is_silent_and_a_gap_is_forgotten():
+    before, gap = np.full(400, 1e-4), np.full(400, math.nan)
+    assert track(np.append(before, gap[: BLOCK - 1]))[0] == pytest.approx(2e-4)
+    assert np.isnan(track(np.append(before, gap[:BLOCK]))).all()
+    assert np.isfinite(track(np.concatenate([before, gap, before]))).all()
+    # Samples from before the gap are in no line with those behind it.
+    jump = np.concatenate([np.full(110, 1e-2), gap, np.full(3000, 1e-4)])
+    assert track(jump)[0] < 5e-3
 
 
 def test_a_block_lasts_as_long_as_the_observers_take():
