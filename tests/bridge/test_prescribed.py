@@ -500,10 +500,13 @@ def test_noise_of_positions_is_passed_on_as_reported(settling_s, has_acceleratio
     motion, passed = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0), []
     for number, value in enumerate(noise.tolist(), start=1):
         motion = update(motion, Sample(0, value, number * TICK_NS), settling_s)
-        passed.append([motion.position_m, motion.velocity_m_per_s, motion.innovation_m])
+        ahead = predict_motion(motion, (number + 5) * TICK_NS)
+        known = motion.position_m, motion.velocity_m_per_s, motion.innovation_m
+        passed.append([*known, *ahead[:2]])
     reported = error_gains(settling_s, 1e-3, has_acceleration=has_acceleration)
     found = np.cov(np.array(passed[100:]).T)
-    assert np.allclose(found[:2, :2], reported.noise, rtol=0.06)
+    assert np.allclose(found[:2, :2], reported.noise[:2, :2], rtol=0.06)
+    assert np.allclose(found[3:, 3:], reported.ahead(5e-3)[0], rtol=0.06)
     assert found[2, 2] == pytest.approx(reported.innovation, rel=0.04)
     changes = np.diff(np.array(passed[100:])[:, 2])
     assert np.mean(changes**2) == pytest.approx(reported.change, rel=0.04)
@@ -522,7 +525,8 @@ def test_noise_and_lag_of_a_motion_are_those_of_its_errors(frequency_hz):
         truth = 1e-3 * omega * math.cos(omega * t_s)
         errors.append(item.values(state, number * TICK_NS)[1] - truth)
     noise_m2, lag_m2 = item.squares_m2(state)
-    stated = item.gains.noise[1, 1] * noise_m2 + item.gains.lag[1] ** 2 * lag_m2
+    noise, lag = item.gains.ahead(0.0)
+    stated = noise[1, 1] * noise_m2 + lag[1] ** 2 * lag_m2
     assert noise_m2 == pytest.approx(noise_m**2, rel=0.2)
     assert np.mean(np.square(errors[2000:])) == pytest.approx(stated, rel=0.15)
     # After a gap the errors are those that there were before.
@@ -553,3 +557,22 @@ def test_a_measured_acceleration_leaves_no_lag():
     assert position_m == pytest.approx(0.4**3, abs=2e-8)
     assert velocity == pytest.approx(3.0 * 0.4**2, abs=4e-3)
     assert acceleration == pytest.approx(6.0 * 0.399)
+
+
+@pytest.mark.parametrize("has_acceleration", [False, True])
+def test_lag_of_a_prediction_is_that_behind_a_constant_jerk(has_acceleration):
+    """By a cubic, or with a measured acceleration that is wrong a parabola, in closed form."""
+    update = update_with_acceleration if has_acceleration else update_motion
+    power, ahead_ns, motion = (
+        2 if has_acceleration else 3,
+        7 * TICK_NS,
+        TrackedMotion(0.0, 0.0, 0.0, 0.0, 0),
+    )
+    for number in range(1, 400):
+        t_s = number * 1e-3
+        motion = update(motion, Sample(0, t_s**power, number * TICK_NS), 0.004)
+    later_s = t_s + 1e-9 * ahead_ns
+    truth = np.array([later_s**power, power * later_s ** (power - 1)])
+    missed = np.array(predict_motion(motion, motion.measured_ns + ahead_ns)[:2]) - truth
+    _, lag = error_gains(0.004, 1e-3, has_acceleration=has_acceleration).ahead(1e-9 * ahead_ns)
+    assert lag * motion.innovation_m == pytest.approx(missed, rel=1e-3)
