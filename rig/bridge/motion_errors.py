@@ -55,17 +55,29 @@ Innovations = tuple[Sequence[Innovation | None], ...]
 """Of each tick of a block those of all channels."""
 
 
+class SensorError(NamedTuple):
+    """What the blocks have shown of the error of a sensor, in squares of its unit.
+
+    Attributes:
+        square: Mean square of what the lines show.
+        white: Share of the noise in it.
+        peak: Fading peak of that square.
+    """
+
+    square: float = 0.0
+    white: float = 0.0
+    peak: float = 0.0
+
+
 class MotionErrors(Struct, frozen=True, gc=False):
-    """What the blocks have shown so far, of c channels (heights, then motions) and k sensors.
+    """What the blocks have shown so far.
 
     Attributes:
         begin_ns: Time at which the present block began.
         end_ns: Time at which it is over.
         blocks: Number of blocks so far.
-        noise_m2: Variance of each channel's noise, shape (c,).
-        square: Mean square of what the lines show of each sensor, shape (k,).
-        white: Share of the noise in it, shape (k,).
-        peak: Fading peak of that square, shape (k,).
+        noise_m2: Variance of the noise of each channel (heights, then motions).
+        sensors: Of each sensor.
         stds: Standard deviation of each sensor; NaN before the first block, and where the heights
             do not determine the sensor.
     """
@@ -73,29 +85,46 @@ class MotionErrors(Struct, frozen=True, gc=False):
     begin_ns: int
     end_ns: int
     blocks: int
-    noise_m2: Array
-    square: Array
-    white: Array
-    peak: Array
+    noise_m2: list[float]
+    sensors: list[SensorError]
     stds: list[float]
 
 
 class ErrorGains(NamedTuple):
-    """How k sensors err by c channels.
+    """How a sensor errs.
 
     Attributes:
-        shown: Error by that of each channel, shape (k, c).
+        shown: Error by that of each channel.
         squares: Their squares.
-        by_noise: Variance by that of the noise of each of h heights that the model follows, (k, h).
-        by_motions: Variance by that of each motion over a block, shape (k, motions).
+        by_noise: Variance by that of the noise of each height that the model follows.
+        by_motions: Variance by that of each motion over a block.
         directly: The same by what is faster, which moves the moved body alone.
     """
 
-    shown: Array
-    squares: Array
-    by_noise: Array
-    by_motions: Array
-    directly: Array
+    shown: list[float]
+    squares: list[float]
+    by_noise: list[float]
+    by_motions: list[float]
+    directly: list[float]
+
+
+class _Line(NamedTuple):
+    """A straight line through the innovations of a channel in a block.
+
+    Attributes:
+        number: Number of innovations.
+        spread_s2: Sum of squares of their times about the mean.
+        noise_m2: Variance of their noise.
+    """
+
+    number: int
+    spread_s2: float
+    mean_m: float
+    slope_m_per_s: float
+    noise_m2: float
+
+
+_TOO_FEW = _Line(0, 1.0, 0.0, 0.0, 0.0)
 
 
 class TrackedErrors(Struct, frozen=True, gc=False):
@@ -108,7 +137,7 @@ class TrackedErrors(Struct, frozen=True, gc=False):
     """
 
     errors: MotionErrors
-    gains: ErrorGains
+    gains: Sequence[ErrorGains]
     pending: Innovations
 
 
@@ -163,16 +192,22 @@ class MotionErrorTracker:
         self._reader, self._sensors = reader, list(sensors)
         self._struts = tuple(struts)
         self._channels = tuple(channels)
-        self._order = np.array(is_rate, dtype=np.intp)
+        self._orders = [int(of_rate) for of_rate in is_rate]
         self._block_ns = block.length_ns
-        self._shown = np.square(block.shown)[self._order]
+        self._shown = [block.shown[order] ** 2 for order in self._orders]
         self._by_noise = by_noise
 
     def init(self, t_ns: int, loaded: Any) -> TrackedErrors:
         """State at the start of a model."""
-        sensors, noise_m2 = np.zeros(len(self._order)), np.zeros(len(self._channels))
-        stds, end_ns = [math.nan] * len(sensors), t_ns + self._block_ns
-        errors = MotionErrors(t_ns, end_ns, 0, noise_m2, sensors, sensors, sensors, stds)
+        count = len(self._orders)
+        errors = MotionErrors(
+            t_ns,
+            t_ns + self._block_ns,
+            0,
+            [0.0] * len(self._channels),
+            [SensorError()] * count,
+            [math.nan] * count,
+        )
         return TrackedErrors(errors, self._find_gains(loaded), ())
 
     def update(
@@ -188,26 +223,26 @@ class MotionErrorTracker:
             gains = self._find_gains(estimator.model_of(state))
         return TrackedErrors(errors, gains, () if errors.begin_ns == t_ns else pending)
 
-    def _find_gains(self, loaded: Any) -> ErrorGains:
-        """How the sensors err where the model is."""
+    def _find_gains(self, loaded: Any) -> list[ErrorGains]:
+        """How each sensor errs where the model is."""
         every = self._reader.motion_gains(loaded, self._struts)
-        by_heights, by_motions, directly = (of_all[self._sensors] for of_all in every)
-        shown = np.concatenate([by_heights, by_motions], axis=1)
-        # One by one: the numbers of one sensor are the same whatever others there are.
-        by_noise = np.array(
-            [
-                [_variance(row, of_channel) for of_channel in self._by_noise[:, order]]
-                for row, order in zip(by_heights, self._order, strict=True)
+        found: list[ErrorGains] = []
+        for sensor, order in zip(self._sensors, self._orders, strict=True):
+            by_heights, by_motions, directly = (of_all[sensor] for of_all in every)
+            shown = np.concatenate([by_heights, by_motions])
+            by_noise = [
+                _variance(by_heights, of_channel) for of_channel in self._by_noise[:, order]
             ]
-        ).reshape(len(by_heights), -1)
-        return ErrorGains(shown, shown**2, by_noise, by_motions**2, directly**2)
+            squares = (part.tolist() for part in (by_motions**2, directly**2))
+            found.append(ErrorGains(shown.tolist(), (shown**2).tolist(), by_noise, *squares))
+        return found
 
     def conclude(
         self,
         errors: MotionErrors,
         innovations: Innovations,
         t_ns: int,
-        gains: ErrorGains,
+        gains: Sequence[ErrorGains],
         motions: Sequence[FollowedError],
     ) -> MotionErrors:
         """State at the end of a block with some innovations, and its standard deviations.
@@ -215,43 +250,46 @@ class MotionErrorTracker:
         The block begins where it did if a channel has too few of them.
         """
         lines = [self._line(channel, innovations, errors.begin_ns) for channel in self._channels]
-        n, spread, mean, slope, new_m2 = np.array(lines).T
-        if n.min() < _FEWEST:
+        if min([line.number for line in lines]) < _FEWEST:
             return self._prolong(errors, innovations, t_ns)
-        order = self._order
         blocks = errors.blocks + 1
         # The first blocks are those of the start, and fade as fast as others come.
         share = max(1.0 / _AVERAGED, 2.0 / (blocks + 1.0))
-        noise_m2 = errors.noise_m2 + share * (new_m2 - errors.noise_m2)
+        noise_m2 = [
+            known + share * (line.noise_m2 - known)
+            for known, line in zip(errors.noise_m2, lines, strict=True)
+        ]
         # Of positions and of rates.
-        shown, by_noise = np.array([mean, slope]), np.array([noise_m2 / n, noise_m2 / spread])
-        new = (gains.shown * shown[order]).sum(axis=1) ** 2
-        of_noise = (gains.squares * by_noise[order]).sum(axis=1)
-        square = errors.square + share * (new - errors.square)
-        white = errors.white + share * (of_noise - errors.white)
-        peak = np.maximum(new, (1.0 - share) * errors.peak)
-        beyond = np.maximum(square - white, peak - _LARGEST_OF_NORMAL * square)
-        variance = np.maximum(beyond, 0.0) / self._shown
-        variance += (gains.by_noise * noise_m2[: len(self._struts)]).sum(axis=1)
+        values = [line.mean_m for line in lines], [line.slope_m_per_s for line in lines]
+        pairs = list(zip(noise_m2, lines, strict=True))
+        whites = [m2 / of.number for m2, of in pairs], [m2 / of.spread_s2 for m2, of in pairs]
         block_s = 1e-9 * (t_ns - errors.begin_ns)
-        for place, motion in enumerate(motions):
-            variance += self._by_motion(gains, place, motion, block_s)
-        end_ns, stds = t_ns + self._block_ns, np.sqrt(variance).tolist()
-        return MotionErrors(t_ns, end_ns, blocks, noise_m2, square, white, peak, stds)
+        of_motions = [_by_motion(motion, block_s) for motion in motions]
+        heights_m2 = noise_m2[: len(self._struts)]
+        sensors: list[SensorError] = []
+        stds: list[float] = []
+        every = zip(errors.sensors, gains, self._orders, self._shown, strict=True)
+        # A dozen numbers: arrays of them would take ten times as long.
+        for before, gain, order, shown in every:
+            new = sum(map(mul, gain.shown, values[order])) ** 2
+            of_noise = sum(map(mul, gain.squares, whites[order]))
+            square = before.square + share * (new - before.square)
+            white = before.white + share * (of_noise - before.white)
+            peak = max(new, (1.0 - share) * before.peak)
+            beyond = max(square - white, peak - _LARGEST_OF_NORMAL * square)
+            variance = max(beyond, 0.0) / shown + sum(map(mul, gain.by_noise, heights_m2))
+            for (slow, fast), *by in zip(of_motions, gain.by_motions, gain.directly, strict=True):
+                variance += by[0] * slow[order] + by[1] * fast[order]
+            sensors.append(SensorError(square, white, peak))
+            stds.append(math.sqrt(variance))
+        return MotionErrors(t_ns, t_ns + self._block_ns, blocks, noise_m2, sensors, stds)
 
-    def _line(
-        self, channel: int, innovations: Innovations, begin_ns: int
-    ) -> tuple[float, float, float, float, float]:
-        """The line through a channel's innovations in a block.
-
-        The result is their number, the sum of squares of their times about the mean (s²), their
-        mean (m), the slope (m/s) and the variance of their noise (m²); the number is zero where
-        they are too few.
-        """
+    def _line(self, channel: int, innovations: Innovations, begin_ns: int) -> _Line:
+        """The line through a channel's innovations in a block."""
         found = {new.t_ns: new.value for each in innovations if each and (new := each[channel])}
         n = len(found)
         if n < _FEWEST:
-            return 0.0, 1.0, 0.0, 0.0, 0.0
+            return _TOO_FEW
         at = [1e-9 * (t_ns - begin_ns) for t_ns in found]
         values = list(found.values())
         mean_s, mean = sum(at) / n, sum(values) / n
@@ -259,7 +297,7 @@ class MotionErrorTracker:
         slope = (sum(map(mul, at, values)) - n * mean_s * mean) / spread
         differences = zip(values, values[1:], values[2:], values[3:], strict=False)
         squares = sum([(d - a + 3.0 * (b - c)) ** 2 for a, b, c, d in differences])
-        return float(n), spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES
+        return _Line(n, spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES)
 
     def _prolong(self, errors: MotionErrors, innovations: Innovations, t_ns: int) -> MotionErrors:
         """State whose block goes on, or begins anew where it has gone on for too long.
@@ -273,23 +311,19 @@ class MotionErrorTracker:
         stds = [math.nan] * len(errors.stds) if is_unknown else errors.stds
         return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns, stds=stds)
 
-    def _by_motion(
-        self, gains: ErrorGains, place: int, motion: FollowedError, block_s: float
-    ) -> Array:
-        """Variance of each sensor by what a motion errs by and no innovation shows, shape (k,).
 
-        All that hangs on a moved body follows the noise as far as it lasts for a block, as that of
-        a parabola through the samples does; what is faster, and the lag, moves the moved body
-        alone.
-        """
-        # Variances of position, rate and acceleration by a block's samples, and after the delay.
-        density, h = motion.sample_m2 * motion.interval_s / block_s, motion.delay_s
-        x, v, a = density, 12.0 * density / block_s**2, 720.0 * density / block_s**4
-        line = np.array([x + h * h * v + 0.25 * h**4 * a, v + h * h * a])
-        slow = np.minimum(motion.noise, line)
-        fast = motion.noise - slow + motion.lag
-        by_motion, directly = gains.by_motions[:, place], gains.directly[:, place]
-        return by_motion * slow[self._order] + directly * fast[self._order]
+def _by_motion(motion: FollowedError, block_s: float) -> tuple[list[float], list[float]]:
+    """Variances of a motion that no innovation shows: of position and rate, slow and fast.
+
+    All that hangs on a moved body follows the noise as far as it lasts for a block, as that of a
+    parabola through the samples does; what is faster, and the lag, moves the moved body alone.
+    """
+    # Variances of position, rate and acceleration by a block's samples, and after the delay.
+    density, h = motion.sample_m2 * motion.interval_s / block_s, motion.delay_s
+    x, v, a = density, 12.0 * density / block_s**2, 720.0 * density / block_s**4
+    line = np.array([x + h * h * v + 0.25 * h**4 * a, v + h * h * a])
+    slow = np.minimum(motion.noise, line)
+    return slow.tolist(), (motion.noise - slow + motion.lag).tolist()
 
 
 def _silent_ticks(channel: int, innovations: Innovations) -> int:
