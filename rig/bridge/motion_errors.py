@@ -281,7 +281,8 @@ class MotionErrorTracker:
             for (slow, fast), *by in zip(of_motions, gain.by_motions, gain.directly, strict=True):
                 variance += by[0] * slow[order] + by[1] * fast[order]
             sensors.append(SensorError(square, white, peak))
-            stds.append(math.sqrt(variance))
+            # A covariance of zero may be rounded to less.
+            stds.append(math.sqrt(max(variance, 0.0)))
         return MotionErrors(t_ns, t_ns + self._block_ns, blocks, noise_m2, sensors, stds)
 
     def _line(self, channel: int, innovations: Innovations, begin_ns: int) -> _Line:

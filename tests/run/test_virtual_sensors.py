@@ -201,6 +201,11 @@ def test_the_check_tells_which_are_corrected(tmp_path):
         # The only force on the body is that of the measured strut.
         "seat": Severity.OK, "power": Severity.OK, "heat": Severity.OK,
     }  # fmt: skip
+    # Forces that PI finds have no deviation, and so has not what depends on them.
+    pi = config(tmp_path, observers={"tyre": {**PI}, "suspension": {**PI}})
+    found = {it.what: it.text for it in check(load_plan(pi))}
+    without = {name for name in SENSORS if "kind kalman" in found[f"virtual sensor {name}"]}
+    assert without == {"seat", "load", "power"}
 
 
 @pytest.mark.parametrize(
