@@ -7,10 +7,10 @@ are wrong).
 
 In blocks about as long as the observers' time constant, a straight line through the innovations of
 each channel shows the errors of position and rate, and their third differences, which a smooth
-error hardly has, show the noise. Each virtual
-sensor of a motion errs by these errors times its gains. Its variance is their mean square over the
-last blocks less that of the noise, or the fading square of an error that occurs now and then, and
-what the observers follow of the noise, which is in the model and not in the innovations.
+error hardly has, show the noise. Each virtual sensor of a motion errs by these errors times its
+gains. Its variance is their mean square over the last blocks less that of the noise, or the fading
+square of an error that occurs now and then, and what the observers follow of the noise, which is in
+the model and not in the innovations.
 
 Reference: Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE TAC 15
 (1970), for innovations that show what a filter lacks.
@@ -90,7 +90,7 @@ class MotionErrors(Struct, frozen=True, gc=False):
     stds: list[float]
 
 
-class ErrorGains(NamedTuple):
+class SensorGains(NamedTuple):
     """How a sensor errs.
 
     Attributes:
@@ -137,11 +137,11 @@ class TrackedErrors(Struct, frozen=True, gc=False):
     """
 
     errors: MotionErrors
-    gains: Sequence[ErrorGains]
+    gains: Sequence[SensorGains]
     pending: Innovations
 
 
-class Block(NamedTuple):
+class InnovationBlock(NamedTuple):
     """Length of a block.
 
     Attributes:
@@ -153,16 +153,16 @@ class Block(NamedTuple):
     shown: tuple[float, float] = (1.0, 1.0)
 
 
-def block_for(corners_per_s: Sequence[float], intervals_ns: Sequence[int]) -> Block:
-    """Block for observers with some corners, and channels at some intervals."""
+def block_for(corners_per_s: Sequence[float], intervals_ns: Sequence[int]) -> InnovationBlock:
+    """InnovationBlock for observers with some corners, and channels at some intervals."""
     longest_ns = max(intervals_ns)
     if not corners_per_s:
-        return Block(_BLOCK * longest_ns)
+        return InnovationBlock(_BLOCK * longest_ns)
     corner_per_s = max(corners_per_s)
     length_ns = max(round(_BLOCK_PER_CORNER * 1e9 / corner_per_s), (_FEWEST + 1) * longest_ns)
     half = min(0.5e-9 * length_ns * corner_per_s, 0.5 * math.pi)
     rate = 3.0 * (math.sin(half) - half * math.cos(half)) / half**3
-    return Block(length_ns, (math.sin(half) / half, rate))
+    return InnovationBlock(length_ns, (math.sin(half) / half, rate))
 
 
 class MotionErrorTracker:
@@ -186,7 +186,7 @@ class MotionErrorTracker:
         struts: Sequence[int],
         channels: Sequence[int],
         is_rate: Sequence[bool],
-        block: Block,
+        block: InnovationBlock,
         by_noise: Array,
     ) -> None:
         self._reader, self._sensors = reader, list(sensors)
@@ -218,15 +218,15 @@ class MotionErrorTracker:
         pending = (*tracked.pending, estimator.innovations(state))
         if t_ns < errors.end_ns:
             return TrackedErrors(errors, gains, pending)
-        errors = self.conclude(errors, pending, t_ns, gains, estimator.motion_errors(state))
+        errors = self._conclude(errors, pending, t_ns, gains, estimator.motion_errors(state))
         if not self._reader.has_constant_gains:
             gains = self._find_gains(estimator.model_of(state))
         return TrackedErrors(errors, gains, () if errors.begin_ns == t_ns else pending)
 
-    def _find_gains(self, loaded: Any) -> list[ErrorGains]:
+    def _find_gains(self, loaded: Any) -> list[SensorGains]:
         """How each sensor errs where the model is."""
         every = self._reader.motion_gains(loaded, self._struts)
-        found: list[ErrorGains] = []
+        found: list[SensorGains] = []
         for sensor, order in zip(self._sensors, self._orders, strict=True):
             by_heights, by_motions, directly = (of_all[sensor] for of_all in every)
             shown = np.concatenate([by_heights, by_motions])
@@ -234,22 +234,22 @@ class MotionErrorTracker:
                 _variance(by_heights, of_channel) for of_channel in self._by_noise[:, order]
             ]
             squares = (part.tolist() for part in (by_motions**2, directly**2))
-            found.append(ErrorGains(shown.tolist(), (shown**2).tolist(), by_noise, *squares))
+            found.append(SensorGains(shown.tolist(), (shown**2).tolist(), by_noise, *squares))
         return found
 
-    def conclude(
+    def _conclude(
         self,
         errors: MotionErrors,
         innovations: Innovations,
         t_ns: int,
-        gains: Sequence[ErrorGains],
+        gains: Sequence[SensorGains],
         motions: Sequence[FollowedError],
     ) -> MotionErrors:
         """State at the end of a block with some innovations, and its standard deviations.
 
         The block begins where it did if a channel has too few of them.
         """
-        lines = [self._line(channel, innovations, errors.begin_ns) for channel in self._channels]
+        lines = [_line(channel, innovations, errors.begin_ns) for channel in self._channels]
         if min([line.number for line in lines]) < _FEWEST:
             return self._prolong(errors, innovations, t_ns)
         blocks = errors.blocks + 1
@@ -278,30 +278,16 @@ class MotionErrorTracker:
             peak = max(new, (1.0 - share) * before.peak)
             beyond = max(square - white, peak - _LARGEST_OF_NORMAL * square)
             variance = max(beyond, 0.0) / shown + sum(map(mul, gain.by_noise, heights_m2))
-            for (slow, fast), *by in zip(of_motions, gain.by_motions, gain.directly, strict=True):
-                variance += by[0] * slow[order] + by[1] * fast[order]
+            of_gains = zip(of_motions, gain.by_motions, gain.directly, strict=True)
+            for (slow, fast), by_motion, directly in of_gains:
+                variance += by_motion * slow[order] + directly * fast[order]
             sensors.append(SensorError(square, white, peak))
             # A covariance of zero may be rounded to less.
             stds.append(math.sqrt(max(variance, 0.0)))
         return MotionErrors(t_ns, t_ns + self._block_ns, blocks, noise_m2, sensors, stds)
 
-    def _line(self, channel: int, innovations: Innovations, begin_ns: int) -> _Line:
-        """The line through a channel's innovations in a block."""
-        found = {new.t_ns: new.value for each in innovations if each and (new := each[channel])}
-        n = len(found)
-        if n < _FEWEST:
-            return _TOO_FEW
-        at = [1e-9 * (t_ns - begin_ns) for t_ns in found]
-        values = list(found.values())
-        mean_s, mean = sum(at) / n, sum(values) / n
-        spread = sum([t * t for t in at]) - n * mean_s * mean_s
-        slope = (sum(map(mul, at, values)) - n * mean_s * mean) / spread
-        differences = zip(values, values[1:], values[2:], values[3:], strict=False)
-        squares = sum([(d - a + 3.0 * (b - c)) ** 2 for a, b, c, d in differences])
-        return _Line(n, spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES)
-
     def _prolong(self, errors: MotionErrors, innovations: Innovations, t_ns: int) -> MotionErrors:
-        """State whose block goes on, or begins anew where it has gone on for too long.
+        """State whose block is prolonged, or starts again where it has lasted for too long.
 
         Nothing is known any more where a channel has been silent for the length of a block.
         """
@@ -311,6 +297,22 @@ class MotionErrorTracker:
         is_unknown = silent * passed_ns >= self._block_ns * len(innovations)
         stds = [math.nan] * len(errors.stds) if is_unknown else errors.stds
         return replace(errors, begin_ns=begin_ns, end_ns=t_ns + self._block_ns, stds=stds)
+
+
+def _line(channel: int, innovations: Innovations, begin_ns: int) -> _Line:
+    """The line through a channel's innovations in a block."""
+    found = {new.t_ns: new.value for each in innovations if each and (new := each[channel])}
+    n = len(found)
+    if n < _FEWEST:
+        return _TOO_FEW
+    at = [1e-9 * (t_ns - begin_ns) for t_ns in found]
+    values = list(found.values())
+    mean_s, mean = sum(at) / n, sum(values) / n
+    spread = sum([t * t for t in at]) - n * mean_s * mean_s
+    slope = (sum(map(mul, at, values)) - n * mean_s * mean) / spread
+    differences = zip(values, values[1:], values[2:], values[3:], strict=False)
+    squares = sum([(d - a + 3.0 * (b - c)) ** 2 for a, b, c, d in differences])
+    return _Line(n, spread, mean, slope, squares / (n - 3) / _OF_THIRD_DIFFERENCES)
 
 
 def _by_motion(motion: FollowedError, block_s: float) -> tuple[list[float], list[float]]:

@@ -8,7 +8,7 @@ import pytest
 
 from dart_model.protocol import MotionGains
 from rig.bridge.estimator import FollowedError
-from rig.bridge.motion_errors import Block, MotionErrorTracker, block_for
+from rig.bridge.motion_errors import InnovationBlock, MotionErrorTracker, block_for
 from rig.bridge.virtual_sensors import products_of, stds_by_force
 from rig.observers.protocol import Innovation
 
@@ -37,7 +37,7 @@ def track(values_m, reader=None, followed=NOTHING_FOLLOWED, channels=(0,), motio
     """Deviations of position and velocity after innovations at 1 kHz, (ticks, channels)."""
     reader = reader or Reader()
     tracker = MotionErrorTracker(
-        reader, (0, 1), (0,), channels, (False, True), Block(BLOCK * MS), followed
+        reader, (0, 1), (0,), channels, (False, True), InnovationBlock(BLOCK * MS), followed
     )
     now = SimpleNamespace()
     estimator = SimpleNamespace(
