@@ -46,7 +46,7 @@ def page(made, server, width=1400, height=900, scheme="light", path=""):
 
 def until(opened, holds):
     """Wait until an expression is true; the page's own policy forbids that it asks itself."""
-    for _ in range(1500):
+    for _ in range(15_000):  # some minutes: a slow machine diagnoses for one
         if opened.evaluate(holds):
             return
         opened.wait_for_timeout(20)
