@@ -7,6 +7,7 @@ of parameters and internal states are its effect's own, and an own name hides th
 import ast
 import functools
 import inspect
+import math
 import textwrap
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -101,29 +102,47 @@ def _own(origin: Origin, items: Sequence[tuple[str, str]]) -> Mapping[str, Argum
 @functools.cache
 def force_over_arrays(effect: Effect) -> ForceOverArrays:
     """The force of an effect as a function of arrays, for callers that know no names."""
-    return _over_arrays(effect.force, effect, (*MOTION, *_ARRAYS[:-1]))
+    tree = parse_law(effect.force, effect)
+    return function_over_arrays(effect.force, effect, tree, (*MOTION, *_ARRAYS[:-1]))
 
 
 @functools.cache
 def rates_over_arrays(effect: Effect) -> RatesOverArrays:
     """The rates of an effect's internal states, likewise; of one without states, none."""
-    return _over_arrays(effect.rate or _no_rates, effect, (*MOTION, *_ARRAYS))
+    law = effect.rate or no_rates
+    return function_over_arrays(law, effect, parse_law(law, effect), (*MOTION, *_ARRAYS))
 
 
 _ARRAYS = ("states", "parameters", "strut", "rates")
 
 
-def _no_rates() -> Rates:
+def no_rates() -> Rates:
+    """The rate of an effect without internal states."""
     return ()
 
 
-def _over_arrays(law: Force | Rate, effect: Effect, names: Sequence[str]) -> FunctionType:
-    # The law is rewritten, not wrapped: a wrapper is a second function to compile for each law. The
-    # code belongs to the law's file, so that numba keeps the machine code next to that file and
-    # drops it when the file changes; the digest in the name covers all else that the code is of.
+def parse_law(law: Force | Rate, effect: Effect) -> ast.FunctionDef:
+    """The syntax tree of the force or the rate of an effect.
+
+    Raises:
+        ArgumentError: It is not a function.
+    """
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(law))).body
     if not isinstance(tree, ast.FunctionDef):
         raise ArgumentError(f"effect {effect.name}: expected a function as its law")
+    return tree
+
+
+def function_over_arrays(
+    law: Force | Rate, effect: Effect, tree: ast.FunctionDef, names: Sequence[str]
+) -> FunctionType:
+    """A function of arrays of some names, by a tree that has the arguments of a law.
+
+    With `rates` among the names it writes what the tree returns there.
+    """
+    # The law is rewritten, not wrapped: a wrapper is a second function to compile for each law. The
+    # code belongs to the law's file, so that numba keeps the machine code next to that file and
+    # drops it when the file changes; the digest in the name covers all else that the code is of.
     taken = arguments(law, effect)
     read = [
         _assign(ast.Name(item.name, ast.Store()), _element(item.origin, ast.Constant(item.first)))
@@ -140,7 +159,7 @@ def _over_arrays(law: Force | Rate, effect: Effect, names: Sequence[str]) -> Fun
     ast.increment_lineno(module, law.__code__.co_firstlineno - 1)
     constants = compile(module, law.__code__.co_filename, "exec").co_consts
     (code,) = (item for item in constants if isinstance(item, CodeType))
-    return FunctionType(code, law.__globals__)
+    return FunctionType(code, law.__globals__ | {"math": math})
 
 
 class _OverArrays(ast.NodeTransformer):

@@ -9,7 +9,7 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given
-from rig.diagnosis.numerics.compiled import SLOTS
+from rig.diagnosis.numerics.laws import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import Result, Verdict
 from rig.diagnosis.problem.build import Problems, build_problems, part_of, with_tones

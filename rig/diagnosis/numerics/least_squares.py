@@ -1,7 +1,7 @@
 """Bounded nonlinear least squares for residuals that come from simulations.
 
-Levenberg-Marquardt with forward differences; a step that leaves the bounds is cut off at them, and
-parameters that must stay positive are searched by their logarithm.
+Levenberg-Marquardt with exact derivatives, or with forward differences; a step that leaves the
+bounds is cut off at them, and parameters that must stay positive are searched by their logarithm.
 
 References:
     Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comput. 19
@@ -136,6 +136,28 @@ class Effort(NamedTuple):
     sides: int = 2
 
 
+class Exact(NamedTuple):
+    """A residual with its exact derivatives by parameters.
+
+    Attributes:
+        residual_of: Residual as a function of parameters, or None where there is none.
+        derivative_of: Its derivative (m, k) by them, where there is one.
+    """
+
+    residual_of: ResidualOf
+    derivative_of: ResidualOf
+
+    def jacobian(self, x: Array, residual: Array, space: Space, sides: int) -> Array:
+        """Derivatives (m, k) at search variables; `sides` is not needed."""
+        del sides
+        values = space.outer(x)
+        columns = self.derivative_of(values)
+        if columns is None or not np.all(np.isfinite(columns)):
+            return np.zeros((len(residual), len(x)))
+        units = np.where(space.logarithmic, values, space.scale)
+        return columns * np.where(space.low < space.high, units, 0.0)
+
+
 class Differences(NamedTuple):
     """A residual with its derivatives by differences.
 
@@ -183,23 +205,27 @@ class Differences(NamedTuple):
 
 
 def solve(
-    differences: Differences, start: Array, space: Space, effort: Effort, prior: Prior | None = None
+    function: Exact | Differences,
+    start: Array,
+    space: Space,
+    effort: Effort,
+    prior: Prior | None = None,
 ) -> Solution | None:
     """Least squares from first parameters (k,); None if there is no residual there."""
     x = space.inner(start)
-    r = differences.residual_of(space.outer(x))
+    r = function.residual_of(space.outer(x))
     if r is None or not np.isfinite(_sum_of_squares(r)):
         return None
     known, damping = prior or Prior(np.zeros_like(x), np.zeros_like(x)), _FIRST_DAMPING
     level = known.level(r)
-    jacobian, fresh = differences.jacobian(x, r, space, 1), True
+    jacobian, fresh = function.jacobian(x, r, space, 1), True
     for _ in range(effort.steps):
         point = _Point(x, r, known.centre, level * known.weight**2)
-        accepted = _lower_cost(differences.residual_of, point, space, (jacobian, fresh), damping)
+        accepted = _lower_cost(function.residual_of, point, space, (jacobian, fresh), damping)
         if accepted is None:
             if fresh:
                 break
-            jacobian, fresh = differences.jacobian(x, r, space, 1), True
+            jacobian, fresh = function.jacobian(x, r, space, 1), True
             continue
         after, damping = accepted
         change, move = after.residual - r, after.x - x
@@ -215,9 +241,9 @@ def solve(
             # The Jacobian is nearly true: Broyden's update costs no simulation.
             jacobian, fresh = jacobian + np.outer(error, move) / float(move @ move), False
         else:
-            jacobian, fresh = differences.jacobian(x, r, space, 1), True
+            jacobian, fresh = function.jacobian(x, r, space, 1), True
     if effort.sides > 1 or not fresh:
-        jacobian = differences.jacobian(x, r, space, effort.sides)
+        jacobian = function.jacobian(x, r, space, effort.sides)
     return Solution(space.outer(x), r, jacobian, _sum_of_squares(r), level, level * known.weight**2)
 
 

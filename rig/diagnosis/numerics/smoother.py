@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from rig.diagnosis.numerics.compiled import compile_loop
+from rig.diagnosis.numerics.laws import compile_loop
 from rig.files.numba_alone import types
 
 Array = NDArray[np.float64]
 
 _ORDER = 4
+_ROUNDING = 1e-12
+"""Share by which covariances that have settled differ from step to step."""
 _SLOWER, _FASTER = 2.5, 7.0
 """Logarithms by which the ratio may lie beyond a time constant of the whole run, and of a step."""
 _AS_LIKELY = 2.0
@@ -161,17 +163,44 @@ def _filter(
 _filter_c = compile_loop(_filter, types.void(_V, _V, _F8, _M, _T3, _V))
 
 
+def _is_steady(a: Array, b: Array) -> bool:
+    """Whether two covariances (4, 4) are the same but for rounding."""
+    for i in range(4):
+        for j in range(i + 1):
+            if abs(a[i, j] - b[i, j]) > _ROUNDING * np.sqrt(b[i, i] * b[j, j]):
+                return False
+    return True
+
+
+_is_steady_c = compile_loop(_is_steady, types.boolean(_M, _M))
+
+
 def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
     a = np.eye(4)
     q = np.zeros((4, 4))
+    g = np.zeros((4, 4))
     last = -1.0
+    filtered = np.zeros((4, 4))
+    before = np.zeros((4, 4))
     for k in range(t.shape[0] - 2, -1, -1):
         h = t[k + 1] - t[k]
-        if abs(h - last) > 1e-12:
+        same = abs(h - last) <= 1e-12
+        if not same:
             _transition_c(h, a, q)
             last = h
-        p: Array = covariances[k].copy()
         m: Array = means[k].copy()
+        if same and _is_steady_c(filtered, covariances[k]):
+            # The filter has settled, and so has the gain; the smoothed covariance will.
+            means[k] = m + g @ (means[k + 1] - a @ m)
+            if _is_steady_c(before, covariances[k + 1]):
+                covariances[k] = before
+                continue
+            before[:] = covariances[k + 1]
+            full = a @ filtered @ a.T + ratio * q
+            covariances[k] = filtered + g @ (before - full) @ g.T
+            continue
+        p: Array = covariances[k].copy()
+        filtered[:] = p
         ap = a @ p
         ahead = ap @ a.T + ratio * q
         # Scale to unit diagonal: the states differ by many orders of magnitude.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from rig.diagnosis.numerics.compiled import Trajectory
+from rig.diagnosis.numerics.march import Trajectory
 from rig.diagnosis.problem.drive import Drive
 from rig.diagnosis.problem.grid import RecordingGrid, Track, fine_times
 from rig.diagnosis.problem.mechanism import LinearisedMechanism

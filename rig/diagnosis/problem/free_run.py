@@ -19,8 +19,17 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from dart_model.effects import Bench
 from dart_model.spec import WORLD, ModelSpec
 from rig.channels.measured_quantities import MOTION
-from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
 from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_between
+from rig.diagnosis.numerics.march import (
+    Equations,
+    Model,
+    Scenario,
+    Steps,
+    Tangents,
+    Trajectory,
+    differentiate,
+    simulate,
+)
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
@@ -34,6 +43,7 @@ from rig.diagnosis.problem.channel_delays import (
     known_share,
     late_columns,
 )
+from rig.diagnosis.problem.directions import by_linear_part, directions_of
 from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
 from rig.diagnosis.problem.driven_run import DrivenRun, driven_run, first_motion, track_of
 from rig.diagnosis.problem.grid import (
@@ -86,6 +96,8 @@ _FORCE_STEP_S = 0.5e-3
 the force of a smoothed motion is rough."""
 _DELAY_STEP_S = 1e-5
 """Step of the difference quotient by the delay of an input."""
+_GAIN_STEP = 1e-4
+"""The same by the gain of a height, of which it is all but linear."""
 _ORDER = 4
 """Columns of a smoothed signal: itself and three derivatives."""
 _IMPLAUSIBLE = 5.0
@@ -97,6 +109,7 @@ class FreeRunProblem(Problem):
     """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
+    is_differentiable: ClassVar[bool] = True
     runs: tuple[DrivenRun, ...]
     noise_m: Array
 
@@ -234,21 +247,32 @@ class FreeRunProblem(Problem):
 
     def simulate(self, run: DrivenRun, model: CandidateModel, start: Array) -> Trajectory | None:
         """Free-run simulation, or None if it runs away or its mass is not positive."""
+        prepared = self._prepare(run, model, start)
+        if prepared is None:
+            return None
+        motion = self._empty_motion(run)
+        laws = slots_of(self, model.candidate).laws
+        return motion if simulate(laws, *prepared, motion) else None
+
+    def _prepare(
+        self, run: DrivenRun, model: CandidateModel, start: Array
+    ) -> tuple[Model, Scenario, Steps] | None:
+        """A model as it is simulated, or None if its mass is not positive."""
         parts = model.parts
         m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
         if m is None:
             return None
-        shape = (len(run.grid.t_s), len(self.noise_m))
-        motion = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
         inverse = np.ascontiguousarray(np.linalg.inv(m.mass), dtype=np.float64)
         equations = Equations(
             inverse, m.bias, m.bias_q, m.bias_v, m.jacobian, m.heights_m, m.rates_m_per_s,
             m.inputs, m.q, m.v,
         )  # fmt: skip
-        slots, struts = slots_of(self, model.candidate), strut_constants(self, parts.linear)
-        finite = simulate(
-            slots.laws,
-            Model(slots.placement, parts.effects, struts, equations),
+        placement, struts = (
+            slots_of(self, model.candidate).placement,
+            strut_constants(self, parts.linear),
+        )
+        return (
+            Model(placement, parts.effects, struts, equations),
             Scenario(
                 start,
                 run.grid.t_s,
@@ -258,20 +282,75 @@ class FreeRunProblem(Problem):
                 run.moved,
             ),
             Steps(run.substeps, _BEND * run.angle**2, self._stroke_m),
-            motion,
         )
-        return motion if finite else None
+
+    def _empty_motion(self, run: DrivenRun) -> Trajectory:
+        shape = (len(run.grid.t_s), len(self.noise_m))
+        return Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Measured less simulated heights over the noise, at the fitted nodes, flat."""
-        run, delays_s = self._before_delays(k, model), self._delays(model).struts
+        run = self._before_delays(k, model)
         motion = self.simulate(run, model, model.parts.starts[k])
-        if motion is None:
-            return None
-        residual = run.grid.heights_m - self._seen(k, model, motion)
+        return None if motion is None else self._compare(k, model, motion)
+
+    def _compare(self, k: int, model: CandidateModel, motion: Trajectory) -> Array:
+        """The residual of a simulated motion."""
+        grid, delays_s = self.runs[k].grid, self._delays(model).struts
+        residual = grid.heights_m - self._seen(k, model, motion)
         if np.any(delays_s):
-            residual *= known_share(run.grid.t_s, delays_s)
-        return (residual[run.grid.fitted] / self.noise_m).ravel()
+            residual *= known_share(grid.t_s, delays_s)
+        return (residual[grid.fitted] / self.noise_m).ravel()
+
+    def derivative(self, k: int, model: CandidateModel, wanted: Flags) -> Array | None:
+        run, parts = self._before_delays(k, model), model.parts
+        prepared = self._prepare(run, model, parts.starts[k])
+        if prepared is None:
+            return None
+        directions, simulated = directions_of(self.linear, wanted, len(parts.effects), run)
+        by = by_linear_part(run.mechanism, self.linear, parts.linear, self._middles_m)
+        motion, delays_s = self._empty_motion(run), self._delays(model).struts
+        shape = (*motion.heights_m.shape, directions.columns)
+        late = bool(np.any(delays_s))
+        tangents = Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
+        slots = slots_of(self, model.candidate)
+        if not differentiate(slots, *prepared, directions, by, motion, tangents):
+            return None
+        weight = self._gains(model) / self.noise_m
+        if late:
+            weight = weight * known_share(run.grid.t_s, delays_s)[run.grid.fitted]
+        columns = np.empty((int(run.grid.fitted.sum()) * len(self.noise_m), int(wanted.sum())))
+        for i, column in enumerate(np.flatnonzero(wanted).tolist()):
+            if column in simulated:
+                d = simulated[column]
+                heights = np.ascontiguousarray(tangents.heights[:, :, d])
+                if late:
+                    rates = np.ascontiguousarray(tangents.velocities[:, :, d])
+                    heights = late_columns(run.grid.t_s, heights, rates, delays_s)
+                columns[:, i] = -(heights[run.grid.fitted] * weight).ravel()
+            else:
+                changed = self._difference(k, model, motion, column)
+                if changed is None:
+                    return None
+                columns[:, i] = changed
+        return columns
+
+    def _difference(
+        self, k: int, model: CandidateModel, motion: Trajectory, parameter: int
+    ) -> Array | None:
+        """Derivative of the residual by a delay or by the gain of a height, as a difference."""
+        linear, kind = model.parts.linear, self.linear[parameter].kind
+        step = _DELAY_STEP_S if kind == "delay" else _GAIN_STEP
+        more, less = (
+            model.with_linear(_changed(linear, parameter, sign * step)) for sign in (1.0, -1.0)
+        )
+        if self.linear[parameter].input < 0:
+            ahead, behind = (self._compare(k, other, motion) for other in (more, less))
+            return (ahead - behind) / (2.0 * step)
+        moved = self.simulate(self._before_delays(k, more), more, model.parts.starts[k])
+        if moved is None:
+            return None
+        return (self._compare(k, more, moved) - self._compare(k, model, motion)) / step
 
     def states(self, k: int, model: CandidateModel) -> Array:
         return model.parts.starts[k][2 * self.runs[k].mechanism.coordinates :]

@@ -8,11 +8,12 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import Motion
-from rig.diagnosis.numerics.compiled import respond
+from rig.diagnosis.numerics.laws import MATRIX, compile_loop
 from rig.diagnosis.problem import linear_part
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.mechanism import LinearisedMechanism, solve_nearest
 from rig.diagnosis.problem.problem import LinearParameter
+from rig.files.numba_alone import types
 
 Array = NDArray[np.float64]
 
@@ -20,6 +21,49 @@ _FILTER_ANGLE = 0.25
 """Longest step of the linear dynamics under a force that is linear between samples, as an angle."""
 _SETTLES_WITHIN = 0.15
 """Time constant of the slowest response of the regression's dynamics, as a share of a segment."""
+
+
+def _respond(
+    transition: Array, early: Array, late: Array, output: Array, forces: Array, heights: Array
+) -> None:
+    size = transition.shape[0]
+    if size == 2 and output.shape[0] == 1 and forces.shape[1] == 1:
+        a00, a01, a10, a11 = transition[0, 0], transition[0, 1], transition[1, 0], transition[1, 1]
+        b0, b1, c0, c1 = early[0, 0], early[1, 0], late[0, 0], late[1, 0]
+        g0, g1 = output[0, 0], output[0, 1]
+        u = 0.0
+        v = 0.0
+        for k in range(forces.shape[0]):
+            heights[k, 0] = g0 * u + g1 * v
+            if k + 1 < forces.shape[0]:
+                f = forces[k, 0]
+                g = forces[k + 1, 0]
+                u, v = a00 * u + a01 * v + b0 * f + c0 * g, a10 * u + a11 * v + b1 * f + c1 * g
+        return
+    x = np.zeros(size)
+    y = np.zeros(size)
+    for k in range(forces.shape[0]):
+        for i in range(output.shape[0]):
+            total = 0.0
+            for j in range(size):
+                total += output[i, j] * x[j]
+            heights[k, i] = total
+        if k + 1 == forces.shape[0]:
+            break
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                total += transition[i, j] * x[j]
+            for j in range(forces.shape[1]):
+                total += early[i, j] * forces[k, j] + late[i, j] * forces[k + 1, j]
+            y[i] = total
+        for i in range(size):
+            x[i] = y[i]
+
+
+respond = compile_loop(_respond, types.void(*(MATRIX,) * 6))
+"""Heights (N, struts), written, of the linear model from rest under forces (N, n): transition,
+input matrices for the force before and after each step, and output matrix of its discretisation."""
 
 
 class FilterMechanism:

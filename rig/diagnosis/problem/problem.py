@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from dart_model.effects import effect
 from dart_model.effects.law import Bench, Motion
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import Slots, slots
 from rig.diagnosis.numerics.delay_step import ForceOverTime
+from rig.diagnosis.numerics.laws import Slots, slots
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem.grid import RecordingGrid, SmoothRecording, Track
 from rig.diagnosis.problem.mechanism import MechanismPlants
@@ -200,6 +200,8 @@ class Problem(ABC):
     """A model held against recordings; fields as in `ProblemBasis`."""
 
     bench: ClassVar[Bench]
+    is_differentiable: ClassVar[bool] = False
+    """Whether `derivative` gives the derivatives of the residual."""
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[ExistingParameters, ...]
@@ -247,6 +249,14 @@ class Problem(ABC):
     @abstractmethod
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Whitened residual of a recording, shape (m,); None where the model runs away."""
+
+    def derivative(self, k: int, model: CandidateModel, wanted: Flags) -> Array | None:
+        """Derivative of a recording's residual by its parts, shape (m, wanted).
+
+        `wanted` are those of linear parameters, effects' parameters and the initial vector, one
+        after another. None where the model runs away.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def floor_level(self, model: CandidateModel) -> float:

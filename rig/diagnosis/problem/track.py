@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import force_along
+from rig.diagnosis.numerics.laws import force_along
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
     CandidateModel,

@@ -13,6 +13,7 @@ References:
 import functools
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from dart_model.effects import Effect, Motion, effect
 from rig.diagnosis.numerics.least_squares import (
     Differences,
     Effort,
+    Exact,
     Prior,
     Rows,
     Solution,
@@ -249,6 +251,31 @@ class _Layout:
     def residual(self, x: Array) -> Array | None:
         return whiten_residual(self.problem, self.model(x))
 
+    def derivative(self, x: Array) -> Array | None:
+        """Derivative of the residual by the search variables' parameters, shape (m, k)."""
+        model, problem = self.model(x), self.problem
+        shared = len(self.first.linear) + len(self.first.effects)
+        slots_of(problem, model.candidate).compile_slopes()  # Here: numba's compiler admits one.
+
+        def own(k: int) -> Array | None:
+            first = shared + k * self.start_size
+            start = self.varied[first : first + self.start_size]
+            return problem.derivative(k, model, np.concatenate([self.varied[:shared], start]))
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            parts = [part for part in pool.map(own, range(problem.recordings)) if part is not None]
+        if len(parts) < problem.recordings:
+            return None
+        common = int(self.varied[:shared].sum())
+        whole = np.zeros((sum(map(len, parts)), len(x)))
+        row, column = 0, common
+        for part in parts:
+            more = part.shape[1] - common
+            whole[row : row + len(part), :common] = part[:, :common]
+            whole[row : row + len(part), column : column + more] = part[:, common:]
+            row, column = row + len(part), column + more
+        return whole
+
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
         """The rows that depend on each variable of an initial vector: those of its recording."""
         if len(blocks) < 2:
@@ -289,7 +316,9 @@ def fit(
     layout = _Layout(problem, first, free, effects)
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
-        Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1),
+        Exact(layout.residual, layout.derivative)
+        if problem.is_differentiable
+        else Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1),
         layout.full[layout.varied],
         layout.space,
         effort,

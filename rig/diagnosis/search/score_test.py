@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.numerics.compiled import compile_law
+from rig.diagnosis.numerics.laws import compile_law
 from rig.diagnosis.numerics.least_squares import Differences, Effort, solve
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (

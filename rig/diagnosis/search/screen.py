@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
 from dart_model.effects.calling import arguments
-from rig.diagnosis.numerics.compiled import compile_law
+from rig.diagnosis.numerics.laws import compile_law
 from rig.diagnosis.numerics.least_squares import (
     Differences,
     Effort,
