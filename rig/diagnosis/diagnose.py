@@ -9,6 +9,7 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given
+from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.numerics.laws import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import Result, Verdict
@@ -58,6 +59,7 @@ def no_progress(_what: str, _share: float) -> None:
     """A progress callback that does nothing."""
 
 
+@with_one_blas_thread
 def diagnose(
     spec: ModelSpec,
     runs: Sequence[Recording],

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from dart_model.spec import ModelSpec
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.search.criteria import CRITERIA
@@ -26,6 +27,7 @@ class OwnParameter(NamedTuple):
     estimate: Estimate
 
 
+@with_one_blas_thread
 def refit_parameters(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnParameter]:
     """Identifiable linear parameters and all effects' parameters, fitted to recordings.
 

@@ -72,7 +72,7 @@ def dart_heights(
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
     states = _plant_states(problem, model, start[2 * plant.free_coordinates :], plant)
-    steps = 2 if run.substeps == 1 else 2 * run.substeps
+    steps = run.substeps
     known = [expected_m[:count]]
     while steps < _MOST_STEPS and 2 * steps * nodes <= _MOST_STEPS_IN_ALL:
         heights_m = _simulate_heights(plant, run, (states, start), count, steps)
