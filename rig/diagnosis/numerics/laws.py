@@ -57,7 +57,6 @@ FORCES = types.ListType(_FORCE)
 RATES = types.ListType(_RATE)
 _TEN_FORCES = types.UniTuple(_FORCE, SLOTS)
 _TEN_RATES = types.UniTuple(_RATE, SLOTS)
-_TEN_SLOPES = types.UniTuple(_RATE, SLOTS)
 _TEN_POINTERS = types.UniTuple(_POINTER, SLOTS)
 
 
@@ -120,7 +119,7 @@ def _slopes(names: tuple[str, ...]) -> "LawSlopes":
     """Derivatives of laws as machine code."""
     forces, rates = typed.List.empty_list(_RATE), typed.List.empty_list(_RATE)
     for name in names:
-        _append_slopes(
+        _append(
             forces,
             rates,
             _force_slopes(name),
@@ -143,21 +142,16 @@ def _empty() -> tuple[Forces, Rates]:
     return typed.List.empty_list(_FORCE), typed.List.empty_list(_RATE)
 
 
-def _append(forces: Forces, rates: Rates, force: ForceOverArrays, rate: RatesOverArrays) -> None:
+def _append(forces: MutableSequence[_R], rates: Rates, force: _R, rate: RatesOverArrays) -> None:
     forces.append(force)
     rates.append(rate)
 
 
-def _append_slopes(
-    forces: Rates, rates: Rates, force: RatesOverArrays, rate: RatesOverArrays
-) -> None:
-    forces.append(force)
-    rates.append(rate)
-
-
-_append_slopes = compile_loop(_append_slopes, types.void(RATES, RATES, _RATE, _RATE))
 _empty = compile_loop(_empty, types.Tuple((FORCES, RATES))())
-_append = compile_loop(_append, types.void(FORCES, RATES, _FORCE, _RATE))
+_append = compile_loop(
+    _append,
+    [types.void(FORCES, RATES, _FORCE, _RATE), types.void(RATES, RATES, _RATE, _RATE)],
+)
 
 
 @functools.cache
@@ -175,6 +169,10 @@ def _laws(names: tuple[str, ...]) -> Laws:
 def compile_law(name: str) -> None:
     """Compile the law of an effect, before threads need it: numba's compiler admits one."""
     _laws((name,))
+
+
+NO_SLOPES = _slopes(("none",) * SLOTS)
+"""Derivatives for a simulation that takes none."""
 
 
 class Slot(NamedTuple):

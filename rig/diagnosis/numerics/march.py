@@ -25,12 +25,13 @@ from rig.diagnosis.numerics.laws import (
     I8,
     INTEGERS,
     MATRIX,
+    NO_SLOPES,
     RATES,
     SLOTS,
     VECTOR,
     Arrays,
     Forces,
-    Laws,
+    LawSlopes,
     Placement,
     Rates,
     Slots,
@@ -457,109 +458,6 @@ def _record(equations: Equations, node: int, work: _Work, out: Trajectory) -> No
         out.accelerations_m_per_s2[node, i] = along_strut
 
 
-@inline
-def _march(
-    model: Model, calls: _Calls, scenario: Scenario, steps: Steps, work: _Work, step: _Step,
-    out: Trajectory,
-) -> bool:  # fmt: skip
-    # Laws take bare pointers, because an array would be counted as held and released at each call.
-    # The pointers come as arguments: numba has no arithmetic to make them of others in the loop,
-    # and to cut an array there for each call takes longer than most laws.
-    tabulated = model.equations.jacobian.shape[0] > 1
-    farthest_m = 1e3 * steps.stroke_m + 1e3 * abs(model.equations.heights_m[0, 0])
-    nodes = scenario.t_s.shape[0]
-    for node in range(nodes):
-        for substep in range(steps.substeps):
-            span = _span(scenario, steps.substeps, node, substep, tabulated)
-            for i in range(step.x.shape[0]):
-                step.began[i] = step.x[i]
-            pieces = 1
-            piece = 0
-            while piece < pieces:
-                h = span.step_s / pieces
-                for stage in range(4):
-                    # Nodes of the classical Runge-Kutta method: 0, 1/2, 1/2, 1.
-                    u = (piece + 0.5 * ((stage + 1) // 2)) / pieces
-                    _begin_stage(stage, h, step, work)
-                    _write_slope(model, calls, scenario, _instant(span, u), work)
-                    if stage == 0 and substep == 0 and piece == 0 and pieces == 1:
-                        _record(model.equations, node, work, out)
-                        if node + 1 == nodes:
-                            return True
-                    _end_stage(stage, h, step, work)
-                piece += 1
-                if pieces < _MOST_PIECES and _has_jump(h, steps, step, work):
-                    # Again, in parts.
-                    for i in range(step.x.shape[0]):
-                        step.x[i] = step.began[i]
-                    pieces = _PIECES if pieces == 1 else _MOST_PIECES
-                    piece = 0
-        if not abs(work.heights_m[0]) < farthest_m:
-            return False
-    return True
-
-
-# Signatures of what is kept on disk hold plain tuples: numba's index of it names the classes of
-# a signature, and could not be read after one of them was renamed.
-_PLACEMENT = types.UniTuple(INTEGERS, 3)
-_EQUATIONS = types.Tuple((CUBE, MATRIX, CUBE, CUBE, CUBE, MATRIX, MATRIX, CUBE, MATRIX, MATRIX))
-_MODEL = types.Tuple((_PLACEMENT, VECTOR, MATRIX, _EQUATIONS))
-_SCENARIO = types.Tuple((*(VECTOR,) * 4, MATRIX, CUBE))
-_STEPS = types.Tuple((I8, F8, F8))
-_TRAJECTORY = types.UniTuple(MATRIX, 3)
-
-
-def _simulate(
-    forces: Forces,
-    rates: Rates,
-    model_parts: tuple[tuple[Integers, ...], Array, Array, Arrays],
-    scenario_parts: Arrays,
-    steps: tuple[int, float, float],
-    out: Arrays,
-) -> bool:
-    # Pointers hold nothing: what they lead to is held by this function or by its caller.
-    placement, equations = Placement(*model_parts[0]), Equations(*model_parts[3])
-    model = Model(placement, model_parts[1], model_parts[2], equations)
-    scenario = Scenario(*scenario_parts)
-    start, struts = scenario.start, model.struts
-    size = start.shape[0]
-    count, n = equations.jacobian.shape[1:]
-    states = np.zeros(SLOTS, dtype=np.int64)
-    parameters = np.zeros(SLOTS, dtype=np.int64)
-    strut = np.zeros(SLOTS, dtype=np.int64)
-    for slot in range(placement.struts.shape[0]):
-        states[slot] = 2 * n + max(placement.first_states[slot], 0)
-        parameters[slot] = placement.first_parameters[slot]
-        strut[slot] = placement.struts[slot] * struts.shape[1]
-    work = _Work(
-        np.zeros(equations.inputs.shape[2]), start.copy(), np.zeros(size),
-        equations.q[0].copy(), equations.v[0].copy(),
-        np.zeros(n), np.zeros(count), np.zeros(count), np.zeros(count),
-    )  # fmt: skip
-    calls = _Calls(
-        ten(forces), ten(rates),
-        pointers(work.x, states), pointers(work.slope, states),
-        pointers(model.parameters, parameters), pointers(struts.ravel(), strut),
-    )  # fmt: skip
-    step = _Step(start.copy(), start.copy(), np.zeros(size), np.zeros(n))
-    return _march(model, calls, scenario, Steps(*steps), work, step, Trajectory(*out))
-
-
-_simulate = compile_loop(
-    _simulate, types.boolean(FORCES, RATES, _MODEL, _SCENARIO, _STEPS, _TRAJECTORY)
-)
-
-
-def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
-    """Free-run simulation, written to `out`, by the classical Runge-Kutta method.
-
-    Returns:
-        Whether the motion stayed finite.
-    """
-    parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
-    return _simulate(*laws, parts, tuple(scenario), steps[:], tuple(out))
-
-
 class Directions(NamedTuple):
     """The parameters by which a simulation is differentiated: their columns, or -1.
 
@@ -698,16 +596,16 @@ def _linear_tangents(
 
 @inline
 def _add_law(
-    rows: tuple[int, int, int, int], places: tuple[int, int, int, int], directions: Directions,
+    rows: tuple[int, int, int], places: tuple[int, int, int], directions: Directions,
     tangent: _TangentWork, out: Array, to: int,
 ) -> None:  # fmt: skip
     """Add the derivatives of a force or a rate.
 
-    `rows` are its first derivative in `laws`, its numbers of states and parameters, and a constant;
+    `rows` are its first derivative in `laws` and the numbers of its states and parameters;
     `places` the strut, the first state and the first parameter.
     """
-    first, states, parameters, _ = rows
-    strut, first_state, first_parameter, _ = places
+    first, states, parameters = rows
+    strut, first_state, first_parameter = places
     laws = tangent.laws
     _add_scaled(laws[first], tangent.heights, strut, out, to)
     _add_scaled(laws[first + 1], tangent.velocities, strut, out, to)
@@ -741,12 +639,12 @@ def _add_effect_tangents(
         parameters = sizes[slot, 1]
         width = 2 + states + parameters + 4
         first_state = 2 * n + max(placement.first_states[slot], 0)
-        places = (i, first_state, placement.first_parameters[slot], 0)
+        places = (i, first_state, placement.first_parameters[slot])
         slopes.forces[slot](
             at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
             calls.states[slot], calls.parameters[slot], calls.struts[slot], slopes.force_rows,
         )  # fmt: skip
-        _add_law((0, states, parameters, 0), places, directions, tangent, tangent.forces, i)
+        _add_law((0, states, parameters), places, directions, tangent, tangent.forces, i)
         if states > 0:
             slopes.rates[slot](
                 at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
@@ -755,7 +653,7 @@ def _add_effect_tangents(
             for s in range(states):
                 for d in range(tangent.slope.shape[1]):
                     tangent.slope[first_state + s, d] = 0.0
-                rows = (tangent.laws.shape[0] // 2 + s * width, states, parameters, 0)
+                rows = (tangent.laws.shape[0] // 2 + s * width, states, parameters)
                 _add_law(rows, places, directions, tangent, tangent.slope, first_state + s)
 
 
@@ -860,18 +758,21 @@ def _record_tangents(equations: Equations, node: int, tangent: _TangentWork, out
 
 
 @inline
-def _march_tangents(
+def _march(
     model: Model, sizes: Integers, calls: _Calls, slopes: _SlopeCalls, scenario: Scenario,
     steps: Steps, directions: Directions, by: ByLinearPart, work: _Work, step: _Step,
     stages: _Stages, tangent: _TangentWork, out: Trajectory, tangents: Tangents,
 ) -> bool:  # fmt: skip
-    """March as `_march` does, each piece of a step followed by that of its derivatives."""
+    # Laws take bare pointers, because an array would be counted as held and released at each call.
+    # The pointers come as arguments: numba has no arithmetic to make them of others in the loop,
+    # and to cut an array there for each call takes longer than most laws.
     tabulated = model.equations.jacobian.shape[0] > 1
     farthest_m = 1e3 * steps.stroke_m + 1e3 * abs(model.equations.heights_m[0, 0])
     nodes = scenario.t_s.shape[0]
     size, columns = tangent.x.shape
     for node in range(nodes):
-        _record_tangents(model.equations, node, tangent, tangents)
+        if columns > 0:
+            _record_tangents(model.equations, node, tangent, tangents)
         for substep in range(steps.substeps):
             span = _span(scenario, steps.substeps, node, substep, tabulated)
             for i in range(size):
@@ -883,6 +784,7 @@ def _march_tangents(
             while piece < pieces:
                 h = span.step_s / pieces
                 for stage in range(4):
+                    # Nodes of the classical Runge-Kutta method: 0, 1/2, 1/2, 1.
                     u = (piece + 0.5 * ((stage + 1) // 2)) / pieces
                     _begin_stage(stage, h, step, work)
                     _write_slope(model, calls, scenario, _instant(span, u), work)
@@ -890,28 +792,39 @@ def _march_tangents(
                         _record(model.equations, node, work, out)
                         if node + 1 == nodes:
                             return True
-                    for i in range(size):
-                        stages.x[stage, i] = work.x[i]
-                        stages.slope[stage, i] = work.slope[i]
+                    if columns > 0:
+                        for i in range(size):
+                            stages.x[stage, i] = work.x[i]
+                            stages.slope[stage, i] = work.slope[i]
                     _end_stage(stage, h, step, work)
                 if pieces < _MOST_PIECES and _has_jump(h, steps, step, work):
+                    # Again, in parts.
                     for i in range(size):
                         step.x[i] = step.began[i]
                         for d in range(columns):
                             tangent.at[i, d] = tangent.began[i, d]
                     pieces = _PIECES if pieces == 1 else _MOST_PIECES
                     piece = 0
-                else:
+                    continue
+                if columns > 0:
                     _step_tangents(
                         model, sizes, calls, slopes, scenario, directions, by, span,
                         (piece, pieces), stages, work, tangent,
                     )  # fmt: skip
-                    piece += 1
+                piece += 1
         if not abs(work.heights_m[0]) < farthest_m:
             return False
     return True
 
 
+# Signatures of what is kept on disk hold plain tuples: numba's index of it names the classes of
+# a signature, and could not be read after one of them was renamed.
+_PLACEMENT = types.UniTuple(INTEGERS, 3)
+_EQUATIONS = types.Tuple((CUBE, MATRIX, CUBE, CUBE, CUBE, MATRIX, MATRIX, CUBE, MATRIX, MATRIX))
+_MODEL = types.Tuple((_PLACEMENT, VECTOR, MATRIX, _EQUATIONS))
+_SCENARIO = types.Tuple((*(VECTOR,) * 4, MATRIX, CUBE))
+_STEPS = types.Tuple((I8, F8, F8))
+_TRAJECTORY = types.UniTuple(MATRIX, 3)
 _FOUR = types.Array(types.float64, 4, "C")
 _DIRECTIONS = types.Tuple((I8, *(INTEGERS,) * 7, I8))
 _BY_LINEAR_PART = types.Tuple((VECTOR, _FOUR, CUBE, _FOUR, CUBE))
@@ -919,7 +832,7 @@ _LAW_SIZES = types.Array(types.int64, 2, "C")
 _TANGENTS = types.UniTuple(CUBE, 2)
 
 
-def _differentiate(
+def _simulate(
     laws: tuple[Forces, Rates, Rates, Rates],
     sizes: Integers,
     model_parts: tuple[tuple[Integers, ...], Array, Array, Arrays],
@@ -932,6 +845,7 @@ def _differentiate(
     out: Arrays,
     tangents: Arrays,
 ) -> bool:
+    # Pointers hold nothing: what they lead to is held by this function or by its caller.
     placement, equations = Placement(*model_parts[0]), Equations(*model_parts[3])
     model = Model(placement, model_parts[1], model_parts[2], equations)
     scenario = Scenario(*scenario_parts)
@@ -974,14 +888,14 @@ def _differentiate(
     slopes = _SlopeCalls(
         ten(laws[2]), ten(laws[3]), pointer(tangent.laws, 0), pointer(tangent.laws, longest)
     )
-    return _march_tangents(
+    return _march(
         model, sizes, calls, slopes, scenario, Steps(*steps), directions, by, work, step, stages,
         tangent, Trajectory(*out), Tangents(*tangents),
     )  # fmt: skip
 
 
-_differentiate = compile_loop(
-    _differentiate,
+_simulate = compile_loop(
+    _simulate,
     types.boolean(
         types.Tuple((FORCES, RATES, RATES, RATES)),
         _LAW_SIZES,
@@ -994,6 +908,24 @@ _differentiate = compile_loop(
         _TANGENTS,
     ),
 )
+
+
+def simulate(slots: Slots, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
+    """Free-run simulation, written to `out`, by the classical Runge-Kutta method.
+
+    Returns:
+        Whether the motion stayed finite.
+    """
+    struts, inputs = model.equations.jacobian.shape[1], model.equations.inputs.shape[2]
+    none = np.full(max(struts, inputs, len(model.parameters)), -1)
+    _, n, _ = model.equations.mass_inverse.shape
+    directions = Directions(0, none, none, none, none, none, none, none, -1)
+    by = ByLinearPart(
+        np.zeros(0), np.zeros((0, 0, n, n)), np.zeros((0, 0, n)), np.zeros((0, 0, n, 0)),
+        np.zeros((0, n, 0)),
+    )  # fmt: skip
+    tangents = Tangents(np.empty((0, struts, 0)), np.empty((0, struts, 0)))
+    return _start(slots, NO_SLOPES, model, scenario, steps, directions, by, out, tangents)
 
 
 def differentiate(
@@ -1011,9 +943,16 @@ def differentiate(
     Returns:
         Whether the motion stayed finite.
     """
+    return _start(slots, slots.slopes, model, scenario, steps, directions, by, out, tangents)
+
+
+def _start(
+    slots: Slots, slopes: LawSlopes, model: Model, scenario: Scenario, steps: Steps,
+    directions: Directions, by: ByLinearPart, out: Trajectory, tangents: Tangents,
+) -> bool:  # fmt: skip
     parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
-    laws = slots.laws.forces, slots.laws.rates, slots.slopes.forces, slots.slopes.rates
-    return _differentiate(
+    laws = slots.laws.forces, slots.laws.rates, slopes.forces, slopes.rates
+    return _simulate(
         laws, slots.sizes, parts, tuple(scenario), steps[:], directions[:], by[:], tuple(out),
         tuple(tangents),
     )  # fmt: skip

@@ -18,11 +18,11 @@ _OF_STRUTS = ("stiffness", "damping", "preload", "free_length", "mass")
 
 
 def directions_of(
-    linear: Sequence[LinearParameter], wanted: Flags, effects: int, run: DrivenRun
+    linear: Sequence[LinearParameter], varied: Flags, effects: int, run: DrivenRun
 ) -> tuple[Directions, dict[int, int]]:
     """Columns of a simulation's derivatives, and the column of each parameter that has one.
 
-    `wanted` are flags of linear parameters, of so many parameters of effects, and of the initial
+    `varied` are flags of linear parameters, of so many parameters of effects, and of the initial
     vector. Delays and gains of heights have no column: they do not change the motion, or change
     what drives it.
     """
@@ -30,7 +30,7 @@ def directions_of(
     of_struts = {kind: np.full(struts, -1) for kind in _OF_STRUTS}
     gain, parameters = np.full(inputs, -1), np.full(effects, -1)
     columns: dict[int, int] = {}
-    for i in np.flatnonzero(wanted[: len(linear)]).tolist():
+    for i in np.flatnonzero(varied[: len(linear)]).tolist():
         kind = linear[i].kind
         if kind in of_struts:
             columns[i] = len(columns)
@@ -39,16 +39,16 @@ def directions_of(
             columns[i] = len(columns)
             gain[linear[i].input] = columns[i]
     first = len(linear)
-    for p in np.flatnonzero(wanted[first : first + effects]).tolist():
+    for p in np.flatnonzero(varied[first : first + effects]).tolist():
         columns[first + p] = len(columns)
         parameters[p] = columns[first + p]
     first += effects
     count, start = len(columns), -1
-    if np.any(wanted[first:]):
+    if np.any(varied[first:]):
         # All of it: a part would save little.
         start = count
-        count += len(wanted) - first
-        columns |= {i: start + i - first for i in range(first, len(wanted))}
+        count += len(varied) - first
+        columns |= {i: start + i - first for i in range(first, len(varied))}
     stiffness, damping, preload, free_length, mass = of_struts.values()
     return (
         Directions(count, stiffness, damping, preload, free_length, mass, gain, parameters, start),

@@ -60,6 +60,7 @@ from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
     ComparedModels,
+    Derivative,
     Flags,
     Integers,
     LinearParameter,
@@ -109,7 +110,6 @@ class FreeRunProblem(Problem):
     """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
-    is_differentiable: ClassVar[bool] = True
     runs: tuple[DrivenRun, ...]
     noise_m: Array
 
@@ -251,8 +251,8 @@ class FreeRunProblem(Problem):
         if prepared is None:
             return None
         motion = self._empty_motion(run)
-        laws = slots_of(self, model.candidate).laws
-        return motion if simulate(laws, *prepared, motion) else None
+        slots = slots_of(self, model.candidate)
+        return motion if simulate(slots, *prepared, motion) else None
 
     def _prepare(
         self, run: DrivenRun, model: CandidateModel, start: Array
@@ -302,12 +302,16 @@ class FreeRunProblem(Problem):
             residual *= known_share(grid.t_s, delays_s)
         return (residual[grid.fitted] / self.noise_m).ravel()
 
-    def derivative(self, k: int, model: CandidateModel, wanted: Flags) -> Array | None:
+    @property
+    def derivative(self) -> Derivative:
+        return self._differentiate
+
+    def _differentiate(self, k: int, model: CandidateModel, varied: Flags) -> Array | None:
         run, parts = self._before_delays(k, model), model.parts
         prepared = self._prepare(run, model, parts.starts[k])
         if prepared is None:
             return None
-        directions, simulated = directions_of(self.linear, wanted, len(parts.effects), run)
+        directions, simulated = directions_of(self.linear, varied, len(parts.effects), run)
         by = by_linear_part(run.mechanism, self.linear, parts.linear, self._middles_m)
         motion, delays_s = self._empty_motion(run), self._delays(model).struts
         shape = (*motion.heights_m.shape, directions.columns)
@@ -319,8 +323,8 @@ class FreeRunProblem(Problem):
         weight = self._gains(model) / self.noise_m
         if late:
             weight = weight * known_share(run.grid.t_s, delays_s)[run.grid.fitted]
-        columns = np.empty((int(run.grid.fitted.sum()) * len(self.noise_m), int(wanted.sum())))
-        for i, column in enumerate(np.flatnonzero(wanted).tolist()):
+        columns = np.empty((int(run.grid.fitted.sum()) * len(self.noise_m), int(varied.sum())))
+        for i, column in enumerate(np.flatnonzero(varied).tolist()):
             if column in simulated:
                 d = simulated[column]
                 heights = np.ascontiguousarray(tangents.heights[:, :, d])

@@ -184,6 +184,14 @@ class RunEvaluation(NamedTuple):
     series: tuple[HeldOutSeries, ...]
 
 
+Derivative = Callable[[int, CandidateModel, Flags], Array | None]
+"""Derivative of a recording's residual by its varied parts, shape (m, varied).
+
+Of the recording's index, a model, and flags of linear parameters, effects' parameters and initial
+vector, one after another. None where the model runs away.
+"""
+
+
 class ProblemBasis(NamedTuple):
     """What the problems of one diagnosis share: the first fields of `Problem`, in their order."""
 
@@ -200,8 +208,6 @@ class Problem(ABC):
     """A model held against recordings; fields as in `ProblemBasis`."""
 
     bench: ClassVar[Bench]
-    is_differentiable: ClassVar[bool] = False
-    """Whether `derivative` gives the derivatives of the residual."""
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[ExistingParameters, ...]
@@ -250,13 +256,10 @@ class Problem(ABC):
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Whitened residual of a recording, shape (m,); None where the model runs away."""
 
-    def derivative(self, k: int, model: CandidateModel, wanted: Flags) -> Array | None:
-        """Derivative of a recording's residual by its parts, shape (m, wanted).
-
-        `wanted` are those of linear parameters, effects' parameters and the initial vector, one
-        after another. None where the model runs away.
-        """
-        raise NotImplementedError
+    @property
+    def derivative(self) -> "Derivative | None":
+        """The derivative of the residual; None where only differences give it."""
+        return None
 
     @abstractmethod
     def floor_level(self, model: CandidateModel) -> float:

@@ -38,6 +38,7 @@ from rig.diagnosis.problem.channel_delays import LONGEST_S, is_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
+    Derivative,
     Integers,
     LinearParameter,
     Parts,
@@ -251,7 +252,7 @@ class _Layout:
     def residual(self, x: Array) -> Array | None:
         return whiten_residual(self.problem, self.model(x))
 
-    def derivative(self, x: Array) -> Array | None:
+    def derivative(self, derivative: Derivative, x: Array) -> Array | None:
         """Derivative of the residual by the search variables' parameters, shape (m, k)."""
         model, problem = self.model(x), self.problem
         shared = len(self.first.linear) + len(self.first.effects)
@@ -260,7 +261,7 @@ class _Layout:
         def own(k: int) -> Array | None:
             first = shared + k * self.start_size
             start = self.varied[first : first + self.start_size]
-            return problem.derivative(k, model, np.concatenate([self.varied[:shared], start]))
+            return derivative(k, model, np.concatenate([self.varied[:shared], start]))
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             parts = [part for part in pool.map(own, range(problem.recordings)) if part is not None]
@@ -316,9 +317,9 @@ def fit(
     layout = _Layout(problem, first, free, effects)
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
-        Exact(layout.residual, layout.derivative)
-        if problem.is_differentiable
-        else Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1),
+        Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1)
+        if problem.derivative is None
+        else Exact(layout.residual, functools.partial(layout.derivative, problem.derivative)),
         layout.full[layout.varied],
         layout.space,
         effort,
