@@ -81,7 +81,7 @@ def _print_channels(diagnosis: "Diagnosis") -> None:
 
 def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
     from rig.pages.report.tables import effects, existing
-    from rig.pages.report.words import missing
+    from rig.pages.report.words import evidence_words, missing
 
     laws, changed = effects(diagnosis), existing(diagnosis)
     if laws:
@@ -91,6 +91,9 @@ def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
             rows.append((styled(name, "bold"), "", ""))
             rows += [(f"  {row[0]}", row[2], row[3]) for row in parameters]
         print_table(("effect", "value", "95 % interval"), rows, "Missing effects")
+        for found in missing(diagnosis):
+            if found.evidence is not None:
+                print_text(f"- {found.name}: {evidence_words(found.evidence)}.")
     for law, note, parameters in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in parameters]
         print_text(f"- {law.name}, {'; '.join((note, *values))}")
@@ -111,10 +114,11 @@ def _print_held_out(diagnosis: "Diagnosis") -> None:
     from rig.pages.report.tables import errors
 
     rows = [
-        (name[:1].lower() + name[1:], before, after, floor)
-        for name, before, after, _, floor, _ in errors(diagnosis)
+        (name[:1].lower() + name[1:], before, linear, after, floor)
+        for name, before, linear, after, _, floor, _ in errors(diagnosis)
     ]
-    print_table(("on held-out data", "before", "after", "noise floor"), rows, "RMS error")
+    heads = ("on held-out data", "before", "best linear model", "after", "noise floor")
+    print_table(heads, rows, "RMS error")
 
 
 def _modes(ended: "Ended") -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given
+from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given, weigh_on_held_out
 from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.numerics.laws import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
@@ -29,7 +29,7 @@ from rig.diagnosis.search.fit import WITH_MEMORY, Fit, fit
 from rig.diagnosis.search.model_selection import SearchResult, select_model
 from rig.diagnosis.search.pool import Pool, ValidatedModel
 from rig.diagnosis.search.surface import fit_surface
-from rig.diagnosis.verdict import are_laws_superfluous, find_verdict
+from rig.diagnosis.verdict import HeldOutLaws, find_reason_against_laws, find_verdict
 from rig.diagnosis.write_up import compose_result
 from rig.recordings.recording import Recording, RecordingError
 
@@ -46,12 +46,16 @@ _MUCH_LESS = 0.5
 a gain of 3 %, where other effects were found in part, made the error 27 times as large."""
 
 
+_LESS_WITHOUT = "taken back: no law explains the held-out data, and a model without it errs less"
+
+
 class _Found(NamedTuple):
     """A search's result, with the problems as they are known in the end."""
 
     problems: Problems
     search: SearchResult
     evaluations: tuple[RunEvaluation, ...]
+    laws: HeldOutLaws
     verdict: Verdict
 
 
@@ -102,12 +106,12 @@ def _diagnose_problems(
         other = _find(_with_gains(problems), criteria, progress)
         if _is_better(other, found):
             found = other
-    problems, search, evaluations, verdict = found
+    problems, search, evaluations, laws, verdict = found
     if verdict == "not_explained":
         progress("tabulating the force that no law explains", 0.97)
         search, evaluations = _least_error_model(problems, search, evaluations)
     return compose_result(
-        problems.learnt, search, verdict, evaluations, criteria, by_blocks=problems.by_blocks
+        problems.learnt, search, verdict, evaluations, laws, criteria, by_blocks=problems.by_blocks
     )
 
 
@@ -147,11 +151,13 @@ def _find(problems: Problems, criteria: SelectionCriteria, progress: Progress) -
     problems = problems._replace(learnt=problem, held_out=held_out)
     linear = search.linear.fit
     evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
-    if search.chosen.size and are_laws_superfluous(problem, linear, evaluations, criteria):
-        search = search._replace(chosen=search.lawless, rivals=())
+    laws = weigh_on_held_out(problems, search.chosen.fit)
+    why = find_reason_against_laws(problem, linear, evaluations, laws, criteria)
+    if search.chosen.size and why:
+        search, laws = search.without_laws(problem, why), {}
         evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
-    verdict = find_verdict(problem, evaluations, search, criteria)
-    return _Found(problems, search, evaluations, verdict)
+    verdict = find_verdict(problem, evaluations, search, laws, criteria)
+    return _Found(problems, search, evaluations, laws, verdict)
 
 
 def _least_error_model(
@@ -162,8 +168,10 @@ def _least_error_model(
     for other in (*([] if table is None else [table]), search.lawless.fit, search.given):
         others = evaluate_held_out(problems, search.linear.fit, other)
         if _error(others) < _error(evaluations):
+            if search.evidence:
+                search = search.without_laws(problems.learnt, _LESS_WITHOUT)
             evaluations = others
-            search = search._replace(chosen=search.chosen._replace(fit=other), rivals=())
+            search = search._replace(chosen=search.chosen._replace(fit=other))
     return search, evaluations
 
 

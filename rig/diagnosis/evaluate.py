@@ -7,20 +7,23 @@ which is not measured, is fitted. An observer with a high gain would hide any mo
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.least_squares import Effort
-from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import HeldOutSeries, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem.build import Problems, build
 from rig.diagnosis.problem.problem import (
     CandidateModel,
     ComparedModels,
     Problem,
     RunEvaluation,
+    StrutEffect,
     first_starts,
+    free_linear,
     nominal,
     nominal_model,
     quadratic_mean,
@@ -28,7 +31,7 @@ from rig.diagnosis.problem.problem import (
     select_nodes,
 )
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import Fit, fit
+from rig.diagnosis.search.fit import Fit, fit, model_for, whiten_residual
 from rig.recordings.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
@@ -80,6 +83,57 @@ def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[
     return _evaluate(held_out, models, fitted_rms_n, blocks=problems.by_blocks)
 
 
+class HeldOutLaw(NamedTuple):
+    """What held-out data say of a law, corrections of the linear part being free.
+
+    Attributes:
+        power: Twice the gain in log likelihood that is expected if the law is right.
+        gain: Twice the gain in log likelihood over the model without it.
+    """
+
+    power: float
+    gain: float
+
+
+def weigh_on_held_out(problems: Problems, corrected: Fit) -> dict[StrutEffect, HeldOutLaw]:
+    """What held-out data say of each law of a model.
+
+    The noise is what the model leaves, at least that of the sensors. The response to a law is
+    projected on what no change of linear parameters and initial states gives, by linearisation. A
+    law without which the model runs away gains without bound.
+    """
+    problem, model = problems.held_out, corrected.model
+    if not model.candidate.new:
+        return {}
+    if problems.by_blocks:
+        problem = problem.of_held_out_blocks()
+    else:
+        model = _fit_starts(problems, model)
+    free = free_linear(problem, model.candidate)
+    base = fit(problem, model, free, Effort(0, sides=1), effects=False)
+    if base is None:
+        return {}
+    level = max(1.0, base.mean_square)
+    nuisance = base.solution.jacobian
+    size = np.linalg.norm(nuisance, axis=0)
+    basis = np.linalg.qr(nuisance[:, size > 0.0] / size[size > 0.0])[0]
+
+    def apart(rows: Array) -> float:
+        rest = rows - basis @ (basis.T @ rows)
+        return float(rest @ rest) / level
+
+    found: dict[StrutEffect, HeldOutLaw] = {}
+    for law in model.candidate.new:
+        less = model_for(problem, model, model.candidate.without(law))
+        residual = whiten_residual(problem, less)
+        if residual is None:
+            found[law] = HeldOutLaw(np.inf, np.inf)
+        else:
+            gain = apart(residual) - apart(base.residual)
+            found[law] = HeldOutLaw(apart(residual - base.residual), gain)
+    return found
+
+
 def _evaluate(
     problem: Problem, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
 ) -> tuple[RunEvaluation, ...]:
@@ -101,21 +155,18 @@ def _join(nodes: Sequence[int], pieces: Sequence[RunEvaluation]) -> RunEvaluatio
     def mean(values: Sequence[float]) -> float:
         return quadratic_mean(values, nodes)
 
-    def both(pairs: Sequence[BeforeAfter]) -> BeforeAfter:
-        return quadratic_means(pairs, nodes)
+    def means(errors: Sequence[ModelErrors]) -> ModelErrors:
+        return quadratic_means(errors, nodes)
 
     figures = [piece.figures for piece in pieces]
     cells = [it.strut_force_rmse_n for it in figures if it.strut_force_rmse_n is not None]
     return RunEvaluation(
         RunFigures(
             figures[0].run,
-            both([it.height_rmse_m for it in figures]),
-            both([it.residual_force_rmse_n for it in figures]),
-            both(cells) if len(cells) == len(figures) else None,
+            means([it.height_rmse_m for it in figures]),
+            means([it.residual_force_rmse_n for it in figures]),
+            means(cells) if len(cells) == len(figures) else None,
         ),
-        both([piece.target for piece in pieces]),
-        mean([piece.linear for piece in pieces]),
-        mean([piece.linear_force_n for piece in pieces]),
         NoiseFloor(
             mean([piece.floor.height_rmse_m for piece in pieces]),
             mean([piece.floor.residual_force_rmse_n for piece in pieces]),

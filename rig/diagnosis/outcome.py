@@ -15,7 +15,10 @@ from rig.files.json_text import json_text
 Array = NDArray[np.float64]
 Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
 Change = Literal["refitted", "superfluous"]
+Confirmation = Literal["confirmed", "not_exercised", "contradicted"]
 
+_FOUR_DEVIATIONS = 2.0
+"""In halves of a 95 % interval."""
 SCHEMA = 1
 DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE = "diagnosis.json", "corrected.yaml", "report.html"
 
@@ -70,9 +73,49 @@ class ChannelCorrection:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether its value is another one than it was taken for."""
+        """Whether its value is another one than it was taken for, by four standard deviations."""
         low, high = self.total.low, self.total.high
-        return low is not None and high is not None and not low <= self.nominal <= high
+        if low is None or high is None:
+            return False
+        half = max(high - self.total.value, self.total.value - low)
+        return abs(self.total.value - self.nominal) > _FOUR_DEVIATIONS * half
+
+
+@dataclass(frozen=True)
+class LikelihoodGain:
+    """Gain of the corrected model's likelihood over another model's, on blocks left out of fits.
+
+    Attributes:
+        over: Effects of the other model; none are those of the best linear model.
+        log_likelihood: Gain of its logarithm; the noise is what the corrected model leaves, at
+            least the sensors'.
+        standard_error: Of that, from the blocks' scatter.
+        error_ratio: RMS residual of the other model over that of the corrected one.
+    """
+
+    over: tuple[str, ...]
+    log_likelihood: float
+    standard_error: float
+    error_ratio: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence for an effect.
+
+    Attributes:
+        without: Gain over the best model of the other effects.
+        rival: Gain over the best model with no effect of its family in its strut, but with others;
+            None where none was fitted.
+        held_out: ``confirmed``; ``not_exercised``: the effect would not show there;
+            ``contradicted``: it would, and the data are as well described without it.
+        held_out_log_likelihood: Gain by it on the held-out data, the linear part being free.
+    """
+
+    without: LikelihoodGain
+    rival: LikelihoodGain | None
+    held_out: Confirmation
+    held_out_log_likelihood: float
 
 
 @dataclass(frozen=True)
@@ -87,6 +130,7 @@ class FoundEffect:
             corrections being in the model.
         force_rms_n: Root mean square of its force along the recordings.
         parameters: Estimates by name.
+        evidence: What speaks for it; None of a linear correction and a table.
     """
 
     family: str
@@ -95,6 +139,12 @@ class FoundEffect:
     explained_fraction: float
     force_rms_n: float
     parameters: dict[str, Estimate]
+    evidence: Evidence | None = None
+
+    @property
+    def is_candidate(self) -> bool:
+        """Whether held-out data do not confirm it."""
+        return self.evidence is not None and self.evidence.held_out != "confirmed"
 
 
 @dataclass(frozen=True)
@@ -126,8 +176,9 @@ class RejectedEffect:
         name: Effect in the catalogue.
         strut: Strut on which it was tested.
         why: One line.
-        left: Residual along the motion with it and the corrected linear part, as a share of the
-            residual without it (1: it explains nothing); None where it was not tested.
+        left: RMS residual with it and the corrected linear part, as a share of the best linear
+            model's (1: it explains nothing): in simulation, out of sample, where it was fitted
+            there, else along the motion; None where it was not tested.
     """
 
     family: str
@@ -155,11 +206,20 @@ class DamperForce:
 
 
 @dataclass(frozen=True)
-class BeforeAfter:
-    """A figure of the nominal model, and of the corrected model."""
+class ModelErrors:
+    """RMS error of three models on the same data, in one unit; NaN where it is not known.
+
+    Attributes:
+        before: Of the nominal model.
+        linear: Of the best linear model: corrected in its linear part alone.
+        after: Of the corrected model.
+        signal: RMS of what is measured, or modelled, about its mean.
+    """
 
     before: float
+    linear: float
     after: float
+    signal: float
 
 
 @dataclass(frozen=True)
@@ -168,15 +228,17 @@ class RunFigures:
 
     Attributes:
         run: Its name.
-        height_rmse_m: Open loop in DART; NaN where the motion is prescribed.
-        residual_force_rmse_n: Force that the model lacks along the smoothed motion.
+        height_rmse_m: Open loop, in DART but for the best linear model; NaN where the motion is
+            prescribed.
+        residual_force_rmse_n: Force that the model lacks along the smoothed motion; the signal is
+            the force of the corrected model's struts there.
         strut_force_rmse_n: Against the load cell, where there is one.
     """
 
     run: str
-    height_rmse_m: BeforeAfter
-    residual_force_rmse_n: BeforeAfter
-    strut_force_rmse_n: BeforeAfter | None
+    height_rmse_m: ModelErrors
+    residual_force_rmse_n: ModelErrors
+    strut_force_rmse_n: ModelErrors | None
 
 
 @dataclass(frozen=True)
@@ -189,17 +251,13 @@ class HeldOut:
         strut_force_rmse_n: Against the load cell, where there is one.
         runs: Each run.
         source: ``runs``, or ``blocks`` where no run was held out and blocks of the recordings were.
-        linear_height_rmse_m: `height_rmse_m` of the best linear model, without any further effect.
-        linear_residual_force_rmse_n: `residual_force_rmse_n` of that model.
     """
 
-    height_rmse_m: BeforeAfter
-    residual_force_rmse_n: BeforeAfter
-    strut_force_rmse_n: BeforeAfter | None
+    height_rmse_m: ModelErrors
+    residual_force_rmse_n: ModelErrors
+    strut_force_rmse_n: ModelErrors | None
     runs: tuple[RunFigures, ...]
     source: Literal["runs", "blocks"]
-    linear_height_rmse_m: float = np.nan
-    linear_residual_force_rmse_n: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -229,7 +287,9 @@ class Diagnosis:
         existing: Effects of the nominal model that the data change.
         rejected: Candidates that were not chosen, best first.
         ambiguous_with: Families that these recordings cannot distinguish from the effects.
-        suggested_excitation: A recording that would distinguish them.
+        suggested_excitation: A recording that would distinguish them, or confirm candidates.
+        left: RMS residual of the effects, out of sample, as a share of the best linear model's;
+            None without effects, or where none explains.
         held_out: Figures on data that took no part in the search.
         noise_floor: RMS that a right model can reach there.
         residual_white: Whether the residual is white.
@@ -255,6 +315,7 @@ class Diagnosis:
     model: str
     damper: tuple[DamperForce, ...] = ()
     channels: tuple[ChannelCorrection, ...] = ()
+    left: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,32 +1,70 @@
 """The verdict on a diagnosis: what held-out data show of the chosen model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rig.diagnosis.outcome import Verdict
-from rig.diagnosis.problem.problem import Problem, RunEvaluation, quadratic_mean
+from rig.diagnosis.evaluate import HeldOutLaw
+from rig.diagnosis.outcome import Confirmation, ModelErrors, Verdict
+from rig.diagnosis.problem.problem import (
+    Problem,
+    RunEvaluation,
+    StrutEffect,
+    quadratic_mean,
+    quadratic_means,
+)
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import Fit
 from rig.diagnosis.search.model_selection import SearchResult
 
+HeldOutLaws = Mapping[StrutEffect, HeldOutLaw]
+"""What held-out data say of each law of the chosen model."""
 
-def are_laws_superfluous(
-    problem: Problem, linear: Fit, evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria
-) -> bool:
-    """Whether all data are at the floor without any law, and laws gain nothing on held-out data.
 
-    A gain below the effect of the applied force's noise counts as none. A law that the data call
-    for may not act on held-out ones, as a stop that is not reached: these do not contradict it.
+def confirmation(law: HeldOutLaw, criteria: SelectionCriteria) -> Confirmation:
+    """What held-out data show of a law."""
+    if law.power < criteria.least_likelihood_gain:
+        return "not_exercised"
+    return "confirmed" if law.gain > 0.0 else "contradicted"
+
+
+def find_reason_against_laws(
+    problem: Problem,
+    linear: Fit,
+    evaluations: Sequence[RunEvaluation],
+    laws: HeldOutLaws,
+    criteria: SelectionCriteria,
+) -> str | None:
+    """The reason for which laws are taken back in favour of the best linear model, if any.
+
+    All data are at the floor without any law, and laws gain nothing on held-out data; or they lose
+    there. Laws that do not act on held-out data, as a stop that is not reached, lose nothing.
     """
-    if not _is_at_floor(problem, linear, criteria):
-        return False
-    after = quadratic_mean([run.target.after for run in evaluations]) ** 2
-    lawless = quadratic_mean([run.linear for run in evaluations]) ** 2
-    floor = quadratic_mean([_floor(run) for run in evaluations]) ** 2
+    if _is_at_floor(problem, linear, criteria) and _gain_nothing(evaluations, criteria):
+        return "taken back: the best linear model is at the noise floor without it"
+    if not any(confirmation(law, criteria) != "not_exercised" for law in laws.values()):
+        return None
+    errors = quadratic_means([run.target for run in evaluations])
+    if errors.after < errors.linear or _reduces_force(evaluations, errors, criteria):
+        return None
+    ratio = errors.after / max(errors.linear, 1e-300)
+    return (
+        "taken back: the error on held-out data is no less than that of the best linear model "
+        f"({ratio:.3g} times)"
+    )
+
+
+def _gain_nothing(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria) -> bool:
+    """Whether laws gain nothing on held-out data, where the linear model is at the floor.
+
+    A gain below the effect of the applied force's noise counts as none.
+    """
+    errors = quadratic_means([run.target for run in evaluations])
+    lawless = errors.linear**2
+    floor = quadratic_mean([run.target_floor for run in evaluations]) ** 2
     drift = quadratic_mean([run.drift_m for run in evaluations]) ** 2
     least = max(criteria.least_above_noise * floor, criteria.least_share * (lawless - floor), drift)
-    return lawless <= criteria.explained**2 * floor and lawless - after <= least
+    return lawless <= criteria.explained**2 * floor and lawless - errors.after**2 <= least
 
 
 def _is_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> bool:
@@ -35,38 +73,46 @@ def _is_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> 
     return result.mean_square <= criteria.explained**2 * floor
 
 
+def _reduces_force(
+    evaluations: Sequence[RunEvaluation], errors: ModelErrors, criteria: SelectionCriteria
+) -> bool:
+    """Whether laws reduce the residual force by a good share, heights being about as good.
+
+    Where heights drift, as those of an axis without a spring do, the force decides.
+    """
+    force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
+    return (
+        force.after < (1.0 - criteria.partly) * force.linear
+        and errors.after < criteria.explained * errors.linear
+    )
+
+
 def find_verdict(
     problem: Problem,
     evaluations: Sequence[RunEvaluation],
     search: SearchResult,
+    laws: HeldOutLaws,
     criteria: SelectionCriteria,
 ) -> Verdict:
     """What held-out data show.
 
     A model explains where every held-out run is at the noise floor; it explains partly where laws
     reduce the residual of the best linear model by a good share. The error of the nominal model
-    does not count. Nothing is missing only where that holds of what was learnt from, too.
+    does not count. Nothing is missing only where that holds of what was learnt from, too. It is
+    ambiguous where rivals explain as well, or held-out data confirm none of its laws.
     """
     chosen = search.chosen.fit
-    ratios = [run.target.after / max(_floor(run), 1e-300) for run in evaluations]
+    ratios = [run.target.after / max(run.target_floor, 1e-300) for run in evaluations]
     if all(ratio <= criteria.explained for ratio in ratios):
         if not (chosen.candidate.new or np.any(chosen.free)):
             at_floor = _is_at_floor(problem, chosen, criteria)
             return "nothing_missing" if at_floor else "not_explained"
-        return "ambiguous" if search.rivals else "explained"
+        is_any_confirmed = any(confirmation(law, criteria) == "confirmed" for law in laws.values())
+        is_certain = not search.rivals and (is_any_confirmed or not laws)
+        return "explained" if is_certain else "ambiguous"
     if chosen.candidate.new and all(np.isfinite(ratios)):
-        share = 1.0 - criteria.partly
-        after = quadratic_mean([run.target.after for run in evaluations])
-        linear = quadratic_mean([run.linear for run in evaluations])
-        force = quadratic_mean([run.figures.residual_force_rmse_n.after for run in evaluations])
-        linear_force = quadratic_mean([run.linear_force_n for run in evaluations])
-        # Where heights drift, as those of an axis without a spring do, the force decides.
-        by_force = force < share * linear_force and after < criteria.explained * linear
-        if after < share * linear or by_force:
+        errors = quadratic_means([run.target for run in evaluations])
+        is_less = errors.after < (1.0 - criteria.partly) * errors.linear
+        if is_less or _reduces_force(evaluations, errors, criteria):
             return "partly_explained"
     return "not_explained"
-
-
-def _floor(run: RunEvaluation) -> float:
-    height = run.floor.height_rmse_m
-    return height if np.isfinite(height) else run.floor.residual_force_rmse_n

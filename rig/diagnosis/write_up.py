@@ -1,7 +1,8 @@
 """The outcome of a search, put together: effects, intervals, figures, corrected model."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from rig.diagnosis.outcome import (
     ChannelCorrection,
     Diagnosis,
     Estimate,
+    Evidence,
     ExistingEffect,
     FittedSeries,
     FoundEffect,
@@ -53,6 +55,7 @@ from rig.diagnosis.search.fit import (
     is_white,
 )
 from rig.diagnosis.search.model_selection import SearchResult
+from rig.diagnosis.verdict import HeldOutLaws, confirmation
 from rig.recordings.stretches import find_stretches
 
 Array = NDArray[np.float64]
@@ -129,29 +132,31 @@ def compose_result(
     search: SearchResult,
     verdict: Verdict,
     evaluations: Sequence[RunEvaluation],
+    laws: HeldOutLaws,
     criteria: SelectionCriteria,
     *,
     by_blocks: bool,
 ) -> Result:
-    """The outcome of a search."""
+    """The outcome of a search; `laws` is what held-out data say of the chosen ones."""
     chosen = search.chosen.fit
     recordings = range(problem.recordings)
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
     estimates = FitEstimates(chosen, fit_covariance(chosen))
     corrected = spec_with_corrections(problem, chosen.model)
-    ambiguous = verdict == "ambiguous"
+    others = _other_families(search) if verdict in ("ambiguous", "partly_explained") else ()
     is_explained = verdict in ("explained", "ambiguous")
     channels = channel_corrections(problem, estimates, is_explained=is_explained)
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
         verdict,
         linear_corrections(problem, estimates),
-        _effects(problem, estimates, after) + _linear_effects(problem, estimates, after, channels),
+        _effects(problem, estimates, after, _evidence(search, laws, criteria))
+        + _linear_effects(problem, estimates, after, channels),
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
-        _other_families(search) if ambiguous else (),
-        _suggestion(search) if ambiguous else None,
+        others,
+        _suggestion(search) if others or verdict == "ambiguous" else None,
         _held_out(evaluations, by_blocks=by_blocks),
         NoiseFloor(
             quadratic_mean([floor.height_rmse_m for floor in floors]),
@@ -172,6 +177,7 @@ def compose_result(
         problem.spec.name,
         damper_forces(problem, chosen, estimates.covariance, after),
         channels,
+        search.left,
     )
     models = search.given.model, chosen.model
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)
@@ -257,8 +263,22 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
     )
 
 
+def _evidence(
+    search: SearchResult, laws: HeldOutLaws, criteria: SelectionCriteria
+) -> dict[StrutEffect, Evidence]:
+    """The evidence for each chosen law."""
+    return {
+        law: Evidence(*search.evidence[law], confirmation(found, criteria), 0.5 * found.gain)
+        for law, found in laws.items()
+        if law in search.evidence
+    }
+
+
 def _effects(
-    problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
+    problem: Problem,
+    estimates: FitEstimates,
+    after: Sequence[ResidualForces | None],
+    evidence: Mapping[StrutEffect, Evidence],
 ) -> tuple[FoundEffect, ...]:
     """The chosen laws, strongest first."""
     model, residuals = estimates.fit.model, [(k, f) for k, f in enumerate(after) if f is not None]
@@ -268,9 +288,8 @@ def _effects(
     for row, (strut, name) in enumerate(model.candidate.new, first):
         residual = np.concatenate([f.force_n[strut] for _, f in residuals])
         parameters = estimates_of(problem, estimates, row, name)
-        effects.append(
-            _describe_effect(problem, (strut, name), residual, forces[row][1], parameters)
-        )
+        found = _describe_effect(problem, (strut, name), residual, forces[row][1], parameters)
+        effects.append(replace(found, evidence=evidence.get((strut, name))))
     return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
 
 
@@ -419,7 +438,6 @@ def _suggestion(search: SearchResult) -> str:
 
 def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldOut:
     figures = [run.figures for run in evaluations]
-    is_prescribed = any(np.isnan(it.height_rmse_m.before) for it in figures)
     cells = [f.strut_force_rmse_n for f in figures if f.strut_force_rmse_n is not None]
     return HeldOut(
         quadratic_means([f.height_rmse_m for f in figures]),
@@ -427,8 +445,6 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
         quadratic_means(cells) if cells else None,
         tuple(figures),
         "blocks" if by_blocks else "runs",
-        np.nan if is_prescribed else quadratic_mean([it.linear for it in evaluations]),
-        quadratic_mean([it.linear_force_n for it in evaluations]),
     )
 
 

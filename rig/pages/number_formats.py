@@ -3,7 +3,7 @@
 import math
 
 from dart_model.effects import Parameter
-from rig.diagnosis.outcome import BeforeAfter, Estimate
+from rig.diagnosis.outcome import Estimate, ModelErrors
 
 _THIN_SPACE = "\u202f"
 _NO_BREAK = "\u00a0"
@@ -108,7 +108,7 @@ def times(factor: float) -> str:
     return f"{factor:.1f}" if factor < 10.0 else f"{factor:.0f}"
 
 
-def change(figure: BeforeAfter) -> str:
+def change(figure: ModelErrors) -> str:
     """Change from before to after, in per cent."""
     if not (figure.before > 0.0 and math.isfinite(figure.after)):
         return "–"

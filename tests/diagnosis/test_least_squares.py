@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.diagnosis.numerics.least_squares import Differences, Effort, Space, solve
+from rig.diagnosis.numerics.least_squares import Differences, Effort, Exact, Space, solve
 
 FREE = Space(
     low=np.full(2, -1e6), high=np.full(2, 1e6), scale=np.ones(2), logarithmic=np.zeros(2, np.bool_)
@@ -45,3 +45,26 @@ def test_a_model_that_runs_away_beyond_a_limit_does_not_end_the_search(runaway):
 def test_a_start_without_a_finite_cost_has_no_solution(residual):
     solution = solve(Differences(lambda _: residual), np.zeros(2), FREE, Effort(steps=5))
     assert solution is None
+
+
+@pytest.mark.parametrize("parted", [np.nan, np.inf, 1e280, None])
+def test_differences_stand_for_a_derivative_without_bound(parted):
+    """A derivative that is exact but for one column, or of which there is none."""
+
+    def derivative_of(_):
+        if parted is None:
+            return None
+        columns = MATRIX.copy()
+        columns[2:, 1] = parted
+        return columns
+
+    function = Exact(derivative_of, Differences(lambda x: MATRIX @ x - MEASURED))
+    residual = -MEASURED
+    found = function.jacobian(np.zeros(2), residual, FREE, 1)
+    np.testing.assert_allclose(found, MATRIX, atol=1e-9)
+
+
+def test_an_exact_derivative_is_taken_as_it_is():
+    slope = np.array([[2.0, 0.0], [0.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    function = Exact(lambda _: slope, Differences(lambda x: MATRIX @ x - MEASURED))
+    np.testing.assert_array_equal(function.jacobian(np.zeros(2), -MEASURED, FREE, 1), slope)

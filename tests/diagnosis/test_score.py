@@ -32,7 +32,7 @@ def with_laws(pool, **laws):
     """The model with laws that were fitted from where they are said to begin."""
     at = {(0, name): np.array(values) for name, values in laws.items()}
     candidate = nominal(pool.problem).with_effects(*at)
-    pool.attempt(model_for(pool.problem, pool.linear.fit, candidate, at), FULL)
+    pool.attempt(model_for(pool.problem, pool.linear.fit.model, candidate, at), FULL)
     return pool.fits[candidate].fit
 
 
@@ -70,7 +70,7 @@ def test_beside_a_damper_friction_is_named_for_what_it_does_at_low_velocity(absu
     (both,) = (model for model in pool.fits.values() if model.size == 2)
     friction = next(law for law in both.fit.candidate.new if law[1] != "valve_damping")
     damper = both.fit.candidate.without(friction)
-    pool.attempt(model_for(pool.problem, both.fit, damper))
+    pool.attempt(model_for(pool.problem, both.fit.model, damper))
     pool.criteria = replace(CRITERIA, **absurd)
     assert pool.adds_dry_friction(pool.fits[damper], both) is is_named
 

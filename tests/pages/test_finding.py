@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.diagnosis.outcome import BeforeAfter
+from rig.diagnosis.outcome import ModelErrors
 from rig.pages.report.finding import find, remainder
 from tests.pages.test_report import FALLS, FRICTION, MASS, SOFTER, found, report
 
-LEFT = BeforeAfter(2.3e-3, 4e-5)
+LEFT = ModelErrors(2.3e-3, 2.3e-3, 4e-5, math.nan)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_what_remains_is_judged_as_the_verdict_judges_it(verdict, ratio):
     effects = (FRICTION,) if verdict not in ("nothing_missing", "not_explained") else ()
     if verdict in ("explained", "nothing_missing"):
         ratio = min(ratio, 1.2)
-    diagnosis = found(verdict, effects, BeforeAfter(2e-3, 1e-5 * ratio))
+    diagnosis = found(verdict, effects, ModelErrors(2e-3, 2e-3, 1e-5 * ratio, math.nan))
     statement = remainder(diagnosis)
     is_noise = verdict in ("explained", "nothing_missing") or (
         verdict == "ambiguous" and ratio <= 1.2
@@ -71,7 +71,7 @@ def test_what_remains_is_judged_as_the_verdict_judges_it(verdict, ratio):
 
 
 def test_a_load_cell_that_does_not_agree_is_said():
-    held_out = replace(found().held_out, strut_force_rmse_n=BeforeAfter(3.0, 9.0))
+    held_out = replace(found().held_out, strut_force_rmse_n=ModelErrors(3.0, 3.0, 9.0, math.nan))
     *_, cell = find(report(replace(found(), held_out=held_out))).certainty
     assert cell.tone == "bad"
     assert "does not agree" in cell.text
@@ -82,8 +82,8 @@ def test_a_load_cell_that_does_not_agree_is_said():
 def test_a_second_pass_that_gains_nothing_names_the_model_to_keep():
     held_out = replace(
         found().held_out,
-        height_rmse_m=BeforeAfter(2.8e-5, 2.7e-5),
-        residual_force_rmse_n=BeforeAfter(0.43, 0.42),
+        height_rmse_m=ModelErrors(2.8e-5, 2.8e-5, 2.7e-5, math.nan),
+        residual_force_rmse_n=ModelErrors(0.43, 0.43, 0.42, math.nan),
     )
     diagnosis = replace(found("not_explained", (), FALLS), held_out=held_out)
     assert "the given model is as good as any" in remainder(diagnosis).text

@@ -14,7 +14,6 @@ from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.outcome import (
-    BeforeAfter,
     DamperForce,
     Diagnosis,
     Estimate,
@@ -24,6 +23,7 @@ from rig.diagnosis.outcome import (
     HeldOut,
     HeldOutSeries,
     LinearCorrection,
+    ModelErrors,
     NoiseFloor,
     RejectedEffect,
     Result,
@@ -68,7 +68,7 @@ PRELOAD = LinearCorrection("strut", "preload_n", 0.0, Estimate(12.3, 11.9, 12.7)
 DAMPING = LinearCorrection("strut", "damping_n_s_per_m", 20.0, Estimate(23.1, None, None), None)
 MASS = LinearCorrection("strut", "mass_kg", 10.0, Estimate(9.55, 9.5, 9.6), None)
 GAIN = LinearCorrection("strut", "input_gain", 1.0, Estimate(1.05, 1.04, 1.06), None)
-FALLS = BeforeAfter(2.31e-3, 10.4e-6)
+FALLS = ModelErrors(2.31e-3, 2.31e-3, 10.4e-6, math.nan)
 REJECTED = (
     RejectedEffect("hysteresis", "dahl", "strut", "explains less on held-out blocks", 0.29),
     RejectedEffect("delay", "delay", "strut", "the motion cannot show it", None),
@@ -78,13 +78,13 @@ REJECTED = (
 def found(
     verdict: Verdict = "explained",
     effects: tuple[FoundEffect, ...] = (FRICTION,),
-    height: BeforeAfter = FALLS,
+    height: ModelErrors = FALLS,
     ambiguous_with: tuple[str, ...] = (),
     suggested: str | None = None,
     run: str = "sweep.csv",
     linear: tuple[LinearCorrection, ...] = (),
 ) -> Diagnosis:
-    force = BeforeAfter(11.8, 0.37)
+    force = ModelErrors(11.8, 11.8, 0.37, math.nan)
     return Diagnosis(
         verdict=verdict,
         linear=linear,
@@ -178,7 +178,7 @@ class Reader(HTMLParser):
     ("diagnosis", "said"),
     [
         (
-            found("nothing_missing", (), BeforeAfter(1e-5, 1e-5)),
+            found("nothing_missing", (), ModelErrors(1e-5, 1e-5, 1e-5, math.nan)),
             ["Nothing is missing", "on held-out data is 10.0 µm", "at the noise floor"],
         ),
         (
@@ -192,7 +192,7 @@ class Reader(HTMLParser):
             ],
         ),
         (
-            found("partly_explained", height=BeforeAfter(2.31e-3, 1e-4)),
+            found("partly_explained", height=ModelErrors(2.31e-3, 2.31e-3, 1e-4, math.nan)),
             ["dry friction", "a part of the residual is not explained", "10 times the noise floor"],
         ),
         (
@@ -208,11 +208,11 @@ class Reader(HTMLParser):
             ],
         ),
         (
-            found("not_explained", (), BeforeAfter(2.31e-3, 2.31e-3)),
+            found("not_explained", (), ModelErrors(2.31e-3, 2.31e-3, 2.31e-3, math.nan)),
             ["no law in the catalogue describes", "2.31 mm", "230 times the noise floor"],
         ),
         (
-            found("not_explained", (TABLE,), BeforeAfter(2.31e-3, 1e-3)),
+            found("not_explained", (TABLE,), ModelErrors(2.31e-3, 2.31e-3, 1e-3, math.nan)),
             [
                 "a table of force over height and velocity, which names no cause, is offered",
                 "to 1.00 mm",
@@ -254,7 +254,7 @@ def test_a_strut_is_named_where_there_are_several() -> None:
 
 
 def test_a_prescribed_motion_is_judged_by_its_force() -> None:
-    unknown = BeforeAfter(math.nan, math.nan)
+    unknown = ModelErrors(math.nan, math.nan, math.nan, math.nan)
     text = sentence(found(height=unknown), 1).replace("\u00a0", " ")
     assert "residual force on held-out data falls from 11.8 N to 0.370 N" in text
 
@@ -381,8 +381,8 @@ def test_the_ranking_shows_eight_candidates_and_folds_the_rest(count: int, folde
 
 
 def test_held_out_forces_are_shown_along_the_prescribed_motion() -> None:
-    force = BeforeAfter(11.8, 0.37)
-    unknown = BeforeAfter(math.nan, math.nan)
+    force = ModelErrors(11.8, 11.8, 0.37, math.nan)
+    unknown = ModelErrors(math.nan, math.nan, math.nan, math.nan)
     runs = tuple(RunFigures(name, unknown, force, force) for name in ("a", "b"))
     diagnosis = replace(found(), held_out=HeldOut(unknown, force, force, runs, "runs"))
     text = shown(report(diagnosis, held_out=(held_out(unit="N"), held_out(unit="N"))))

@@ -23,6 +23,9 @@ ResidualOf = Callable[[Array], Array | None]
 
 _DIFFERENCE = 1e-4
 """Step of the forward differences in units of the search."""
+_PARTED = 1e3
+"""Change by that step, in residuals, from which on a derivative is that of a simulation that parts
+from its neighbours: of others it is a small share of the signal, which is ten thousand at most."""
 _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e9
 _TRUE = 0.05
@@ -136,28 +139,6 @@ class Effort(NamedTuple):
     sides: int = 2
 
 
-class Exact(NamedTuple):
-    """A residual with its exact derivatives by parameters.
-
-    Attributes:
-        residual_of: Residual as a function of parameters, or None where there is none.
-        derivative_of: Its derivative (m, k) by them, where there is one.
-    """
-
-    residual_of: ResidualOf
-    derivative_of: ResidualOf
-
-    def jacobian(self, x: Array, residual: Array, space: Space, sides: int) -> Array:
-        """Derivatives (m, k) at search variables; `sides` is not needed."""
-        del sides
-        values = space.outer(x)
-        columns = self.derivative_of(values)
-        if columns is None or not np.all(np.isfinite(columns)):
-            return np.zeros((len(residual), len(x)))
-        units = np.where(space.logarithmic, values, space.scale)
-        return columns * np.where(space.low < space.high, units, 0.0)
-
-
 class Differences(NamedTuple):
     """A residual with its derivatives by differences.
 
@@ -201,6 +182,41 @@ class Differences(NamedTuple):
             # The simulations are machine code, which releases the interpreter's lock.
             with ThreadPoolExecutor(self.threads) as pool:
                 list(pool.map(fill, range(len(x))))
+        return columns
+
+
+class Exact(NamedTuple):
+    """A residual with its exact derivatives by parameters.
+
+    Where a simulation that switches parts from its neighbours within a few steps, its derivative is
+    without bound, or without value, and says nothing of them: there differences stand for it.
+
+    Attributes:
+        derivative_of: Its derivative (m, k) by them, where there is one.
+        differences: The residual, with differences.
+    """
+
+    derivative_of: ResidualOf
+    differences: Differences
+
+    @property
+    def residual_of(self) -> ResidualOf:
+        """Residual as a function of parameters, or None where there is none."""
+        return self.differences.residual_of
+
+    def jacobian(self, x: Array, residual: Array, space: Space, sides: int) -> Array:
+        """Derivatives (m, k) at search variables; `sides` is that of differences."""
+        values = space.outer(x)
+        columns = self.derivative_of(values)
+        if columns is None:
+            return self.differences.jacobian(x, residual, space, sides)
+        units = np.where(space.logarithmic, values, space.scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns = columns * np.where(space.low < space.high, units, 0.0)
+            moves = _DIFFERENCE * np.linalg.norm(columns, axis=0)
+        parted = ~(moves <= _PARTED * np.linalg.norm(residual))
+        if np.any(parted):
+            columns[:, parted] = self.differences.jacobian(x, residual, space, sides)[:, parted]
         return columns
 
 

@@ -31,7 +31,7 @@ from rig.diagnosis.numerics.march import (
     simulate,
 )
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
-from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import HeldOutSeries, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
 from rig.diagnosis.problem.channel_delays import (
     SIGNIFICANT,
@@ -74,6 +74,7 @@ from rig.diagnosis.problem.problem import (
     nominal,
     nominal_model,
     rms,
+    rms_about_mean,
     select_nodes,
     slots_of,
     state_scales,
@@ -172,6 +173,10 @@ class FreeRunProblem(Problem):
 
     def fit_nodes(self, k: int) -> Flags:
         return self.runs[k].grid.fitted
+
+    def of_held_out_blocks(self) -> "FreeRunProblem":
+        runs = tuple(run._replace(grid=run.grid.of_held_out) for run in self.runs)
+        return replace(self, runs=runs)
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRunProblem":
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
@@ -319,6 +324,8 @@ class FreeRunProblem(Problem):
         tangents = Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
         slots = slots_of(self, model.candidate)
         if not differentiate(slots, *prepared, directions, by, motion, tangents):
+            return None
+        if not all(np.all(np.isfinite(part)) for part in tangents):
             return None
         weight = self._gains(model) / self.noise_m
         if late:
@@ -719,11 +726,15 @@ class FreeRunProblem(Problem):
             )
             on_dart_m.append(self._as_read(k, model, found_m, None))
         forces = [self.residual_forces(k, model) for model in models]
-        residual_n = [
+        before_n, linear_n, after_n = (
             np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces
-        ]
-        heights = BeforeAfter(*(rms(measured - heights_m) for heights_m in on_dart_m))
-        deviation = np.nan if forces[2] is None else rms(forces[2].deviation_n)
+        )
+        signal_n = self._strut_force_n(k, models.corrected, forces[2], rows)
+        heights = ModelErrors(
+            rms(measured - on_dart_m[0]), rms(measured - seen_m[1]), rms(measured - on_dart_m[1]),
+            rms_about_mean(measured),
+        )  # fmt: skip
+        deviation_n = np.nan if forces[2] is None else rms(forces[2].deviation_n)
         disturbances = self.disturbances_m(k, models.corrected, _FLOOR_DRAWS)
         drift_m = max((rms(heights_m) for heights_m in disturbances), default=0.0)
         floor_m = float(np.hypot(rms(noise), drift_m))
@@ -738,17 +749,23 @@ class FreeRunProblem(Problem):
         figures = RunFigures(
             grid.name,
             heights,
-            BeforeAfter(residual_n[0], residual_n[2]),
-            self._cell_errors(k, models, (before, after), rows),
+            ModelErrors(before_n, linear_n, after_n, signal_n),
+            self._cell_errors(k, models, motions, rows),
         )
-        return RunEvaluation(
-            figures, heights, rms(measured - seen_m[1]), residual_n[1],
-            NoiseFloor(floor_m, deviation), drift_m, series,
-        )  # fmt: skip
+        return RunEvaluation(figures, NoiseFloor(floor_m, deviation_n), drift_m, series)
+
+    def _strut_force_n(
+        self, k: int, model: CandidateModel, along: ResidualForces | None, rows: Flags
+    ) -> float:
+        """RMS of a model's strut forces about their means, along the smoothed motion."""
+        if along is None:
+            return np.nan
+        forces = track.strut_forces(self, model, along.track, self.states(k, model))
+        return rms_about_mean(np.where(rows, forces, np.nan).T)
 
     def _cell_errors(
-        self, k: int, models: ComparedModels, motions: tuple[Trajectory, Trajectory], rows: Flags
-    ) -> BeforeAfter | None:
+        self, k: int, models: ComparedModels, motions: Sequence[Trajectory], rows: Flags
+    ) -> ModelErrors | None:
         """Errors against the load cell where it is evaluated, the models in free run."""
         run = self.runs[k]
         if run.cells is None or any(self.plants.plain.mockups):
@@ -756,13 +773,14 @@ class FreeRunProblem(Problem):
         t_s, cells_n = run.cells
         evaluated = np.interp(t_s, run.grid.t_s, rows) > 0.5
         cells = np.where(evaluated[:, np.newaxis], cells_n, np.nan)
-        errors: list[float] = []
-        for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
+        errors_n: list[float] = []
+        for model, motion in zip(models, motions, strict=True):
             at = self._forces_at(t_s, k, model, motion)
             if model is models.corrected:
                 at = _late_as(cells, at, run.grid.step_s)
-            errors.append(rms(cells - at))
-        return BeforeAfter(*errors)
+            errors_n.append(rms(cells - at))
+        before_n, linear_n, after_n = errors_n
+        return ModelErrors(before_n, linear_n, after_n, rms_about_mean(cells))
 
     def _forces_at(self, t_s: Array, k: int, model: CandidateModel, motion: Trajectory) -> Array:
         """Forces (N, struts) of a model along a motion of its own, at times (N,)."""

@@ -109,6 +109,11 @@ class RecordingGrid(NamedTuple):
             temperature_c=self.temperature_c[nodes],
         )
 
+    @property
+    def of_held_out(self) -> "RecordingGrid":
+        """The recording with its held-out nodes alone as those that take part in fits."""
+        return self._replace(fitted=self.held_out)
+
     def pieces_between(self, gaps_s: Sequence[tuple[float, float]]) -> list[slice]:
         """Nodes between gaps, given by begin and end of each, without pieces that are too short."""
         begins = [self.t_s[0], *(end for _, end in gaps_s)]

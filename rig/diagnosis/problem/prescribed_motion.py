@@ -17,7 +17,7 @@ from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.delay_step import ForceOverTime
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
-from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import HeldOutSeries, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.channel_delays import delays_of, known_share
 from rig.diagnosis.problem.grid import (
@@ -41,6 +41,7 @@ from rig.diagnosis.problem.problem import (
     nominal,
     nominal_model,
     rms,
+    rms_about_mean,
     select_nodes,
     state_scales,
     strut_effects,
@@ -192,6 +193,10 @@ class PrescribedProblem(Problem):
     def fit_nodes(self, k: int) -> Flags:
         return self.runs[k].fit_nodes
 
+    def of_held_out_blocks(self) -> "PrescribedProblem":
+        runs = tuple(run._replace(grid=run.grid.of_held_out) for run in self.runs)
+        return replace(self, runs=runs)
+
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
 
@@ -342,7 +347,8 @@ class PrescribedProblem(Problem):
             track.strut_forces(self, model, along, self.states(k, model))
             for model, along in zip(models, tracks, strict=True)
         ]
-        error = BeforeAfter(rms(measured - forces[0]), rms(measured - forces[2]))
+        before_n, linear_n, after_n = (rms(measured - force) for force in forces)
+        errors = ModelErrors(before_n, linear_n, after_n, rms_about_mean(measured.T))
         series = tuple(
             HeldOutSeries(
                 run.grid.name, self.spec.struts[i].name, "N", run.grid.t_s, measured[i],
@@ -353,11 +359,9 @@ class PrescribedProblem(Problem):
         )  # fmt: skip
         # Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
         floor_n = min(fitted_rms_n, self._motion_floor_n(k, models.corrected))
-        figures = RunFigures(run.grid.name, BeforeAfter(np.nan, np.nan), error, error)
-        linear_n = rms(measured - forces[1])
-        return RunEvaluation(
-            figures, error, linear_n, linear_n, NoiseFloor(np.nan, floor_n), 0.0, series
-        )
+        no_heights = ModelErrors(np.nan, np.nan, np.nan, np.nan)
+        figures = RunFigures(run.grid.name, no_heights, errors, errors)
+        return RunEvaluation(figures, NoiseFloor(np.nan, floor_n), 0.0, series)
 
     def _motion_floor_n(self, k: int, model: CandidateModel) -> float:
         """RMS residual force of a right model: noise of the cell, and of the motion by the law.

@@ -10,6 +10,7 @@ References:
     through the model's own dynamics.
 """
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from dart_model.effects.law import Bench, Motion
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.delay_step import ForceOverTime
 from rig.diagnosis.numerics.laws import Slots, slots
-from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import HeldOutSeries, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem.grid import RecordingGrid, SmoothRecording, Track
 from rig.diagnosis.problem.mechanism import MechanismPlants
 
@@ -170,18 +171,25 @@ class RunEvaluation(NamedTuple):
     """Figures of one held-out recording.
 
     Attributes:
-        target: Error that decides (of height or load cell), of nominal and corrected model.
-        linear: The same of the best linear model.
         drift_m: Share of the floor that noise of the applied force causes; zero on a dyno.
     """
 
     figures: RunFigures
-    target: BeforeAfter
-    linear: float
-    linear_force_n: float
     floor: NoiseFloor
     drift_m: float
     series: tuple[HeldOutSeries, ...]
+
+    @property
+    def target(self) -> ModelErrors:
+        """The errors that decide: of the height, or of the force where the motion is prescribed."""
+        heights = self.figures.height_rmse_m
+        return heights if np.isfinite(heights.after) else self.figures.residual_force_rmse_n
+
+    @property
+    def target_floor(self) -> float:
+        """The noise floor of these errors."""
+        heights = self.floor.height_rmse_m
+        return heights if np.isfinite(heights) else self.floor.residual_force_rmse_n
 
 
 Derivative = Callable[[int, CandidateModel, Flags], Array | None]
@@ -311,6 +319,10 @@ class Problem(ABC):
         """
 
     @abstractmethod
+    def of_held_out_blocks(self) -> Self:
+        """The problem of the blocks that are held out, in place of all others."""
+
+    @abstractmethod
     def segments(
         self, model: CandidateModel, most_samples: int, largest_stride: int
     ) -> tuple[Segment, ...]:
@@ -373,17 +385,23 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def quadratic_mean(values: Sequence[float], weights: Sequence[int] | None = None) -> float:
+def rms_about_mean(values: Array) -> float:
+    """RMS about the mean of their column of the values (N, n) that are not NaN."""
+    known = values[:, np.any(np.isfinite(values), axis=0)]
+    return rms(known - np.nanmean(known, axis=0)) if known.size else np.nan
+
+
+def quadratic_mean(values: Sequence[float] | Array, weights: Sequence[int] | None = None) -> float:
     """Quadratic mean; NaN if a value is."""
     return float(np.sqrt(np.average(np.square(values), weights=weights)))
 
 
 def quadratic_means(
-    pairs: Sequence[BeforeAfter], weights: Sequence[int] | None = None
-) -> BeforeAfter:
-    """Quadratic means before and after."""
-    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
-    return BeforeAfter(quadratic_mean(before, weights), quadratic_mean(after, weights))
+    errors: Sequence[ModelErrors], weights: Sequence[int] | None = None
+) -> ModelErrors:
+    """Quadratic means of the errors of each model, and of the signal."""
+    rows = np.array([dataclasses.astuple(item) for item in errors])
+    return ModelErrors(*(quadratic_mean(column, weights) for column in rows.T))
 
 
 def strut_effects(problem: Problem, candidate: Candidate) -> tuple[StrutEffect, ...]:

@@ -33,6 +33,9 @@ class SelectionCriteria:
             model is preferred: the one-standard-error rule (Breiman et al., Classification and
             Regression Trees, 1984, 3.4.3). With more, effects of few blocks would be lost: an
             effect that acts in k blocks alone gains sqrt(k) standard errors.
+        level: Probability that a rival which is right, and as plain, is distinguished from the
+            chosen model by chance: of Student's distribution of the gain over its standard error by
+            the blocks. A hundredth is usual where a name has consequences.
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
             law, a better formula or a linear correction. The best of some hundred useless starts
             gains 2 ln 100 = 9 by chance; an autocorrelated residual that much more often.
@@ -81,6 +84,7 @@ class SelectionCriteria:
     fitted_a_size: int = 4
     hopeless: float = 4.0
     standard_errors: float = 1.0
+    level: float = 0.01
     least_likelihood_gain: float = 30.0
     least_share: float = 0.19
     least_above_noise: float = 0.01

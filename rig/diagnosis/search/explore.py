@@ -205,7 +205,7 @@ def _expand_in_simulation(
     candidate = nominal(pool.problem).with_effects(*base)
     if candidate != reference.fit.candidate:
         # Its first fit may have ended in a side valley, which the larger model has left.
-        pool.attempt(model_for(pool.problem, reference.fit, candidate))
+        pool.attempt(model_for(pool.problem, reference.fit.model, candidate))
     # Laws that explain nothing alone have the linear model's tangent, which is searched already.
     if candidate not in pool.fits or not pool.prefers(pool.fits[candidate], pool.linear):
         return

@@ -316,10 +316,11 @@ def fit(
     """
     layout = _Layout(problem, first, free, effects)
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
+    differences = Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1)
     solution = solve(
-        Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1)
+        differences
         if problem.derivative is None
-        else Exact(layout.residual, functools.partial(layout.derivative, problem.derivative)),
+        else Exact(functools.partial(layout.derivative, problem.derivative), differences),
         layout.full[layout.varied],
         layout.space,
         effort,
@@ -481,27 +482,28 @@ def law_values(problem: Problem, result: Fit) -> dict[StrutEffect, Array]:
 
 def model_for(
     problem: Problem,
-    result: Fit,
+    model: CandidateModel,
     candidate: Candidate,
     further: Mapping[int | StrutEffect, Array] = MappingProxyType({}),
 ) -> CandidateModel:
-    """A fitted model with the effects of another candidate, further laws starting at rest.
+    """A model with the effects of another candidate, further laws starting at rest.
 
-    `further` are parameters of laws that the fitted model lacks.
+    `further` are parameters of laws that the model lacks.
     """
-    old, new = slots_of(problem, result.candidate), slots_of(problem, candidate)
-    known = dict(zip((*result.candidate.kept, *result.candidate.new), old.each, strict=True))
+    (before, parts), new = model, slots_of(problem, candidate)
+    old = slots_of(problem, before)
+    known = dict(zip((*before.kept, *before.new), old.each, strict=True))
     effects: list[Array] = []
     states: list[Array] = [np.zeros((problem.recordings, 0))]
-    internal = np.array([start[len(start) - old.states :] for start in result.parts.starts])
+    internal = np.array([start[len(start) - old.states :] for start in parts.starts])
     for key, slot in zip((*candidate.kept, *candidate.new), new.each, strict=True):
         if key in known:
-            effects.append(result.parts.effects[known[key].parameters])
+            effects.append(parts.effects[known[key].parameters])
             states.append(internal[:, known[key].states])
         else:
             effects.append(further[key])
             states.append(np.zeros((problem.recordings, slot.states.stop - slot.states.start)))
-    motions = (start[: len(start) - old.states] for start in result.parts.starts)
+    motions = (start[: len(start) - old.states] for start in parts.starts)
     starts = (np.append(*both) for both in zip(motions, np.hstack(states), strict=True))
-    parts = Parts(result.parts.linear, np.concatenate([np.zeros(0), *effects]), tuple(starts))
-    return CandidateModel(candidate, parts)
+    values = np.concatenate([np.zeros(0), *effects])
+    return CandidateModel(candidate, Parts(parts.linear, values, tuple(starts)))

@@ -1,6 +1,6 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from itertools import chain
 from typing import NamedTuple
@@ -12,11 +12,13 @@ from dart_model.effects import effect
 from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.channel_delays import is_undetermined
-from rig.diagnosis.problem.problem import Candidate, CandidateModel, Problem, StrutEffect, nominal
+from rig.diagnosis.problem.problem import Candidate, CandidateModel, Problem, StrutEffect
 from rig.diagnosis.progress import Progress
+from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel
+from rig.diagnosis.search.rejections import list_rejections, residual_left
 from rig.diagnosis.search.screen import (
     as_screening,
     candidate_laws,
@@ -45,6 +47,9 @@ class SearchResult(NamedTuple):
         lawless: The same with significant corrections alone.
         rivals: Models with other families that the data cannot distinguish from it.
         superfluous: Existing effects, by index, without which the data are as well described.
+        left: RMS residual of the chosen model, out of sample, as a share of the best linear one's;
+            None where it has no law.
+        evidence: Gains by each law of the chosen model on blocks left out of fits.
         gain_alike: Whether a gain of the applied force replaces mass, stiffness and damping, or two
             of them, that changed in one proportion.
     """
@@ -56,7 +61,23 @@ class SearchResult(NamedTuple):
     rivals: tuple[ValidatedModel, ...]
     superfluous: tuple[int, ...]
     rejected: tuple[RejectedEffect, ...]
+    left: float | None
+    evidence: Mapping[StrutEffect, LeftOutGains]
     gain_alike: bool
+
+    def without_laws(self, problem: Problem, why: str) -> "SearchResult":
+        """The result with the laws taken back, for a reason that held-out data give."""
+        back = tuple(
+            RejectedEffect(effect(name).family, name, problem.spec.struts[at].name, why, self.left)
+            for at, name in self.chosen.fit.candidate.new
+        )
+        return self._replace(
+            chosen=self.lawless,
+            rivals=(),
+            rejected=(*back, *self.rejected),
+            left=None,
+            evidence={},
+        )
 
 
 def select_model(
@@ -76,15 +97,18 @@ def select_model(
         most_laws = chosen.size
         _attempt_plainer(pool, chosen)
     progress("comparing rivals", 0.9)
+    single = [it.laws[-1] for it in first_round.screenings] if first_round else []
+    evidence, rejected = weigh_laws(pool, first, single, chosen), ()
     rivals = _rivals(pool, chosen) or _rivals_of_one_frequency(pool, final)
     superfluous = _superfluous_effects(pool, chosen)
     lawless = _with_few_corrections(pool, pool.linear)[0] if final.size else final
-    rejected = ()
     if first_round is not None:
-        rejected = _list_rejections(first, first_round, pool.linear, final, rivals)
+        rejected = list_rejections(pool, first, first_round, final, rivals)
+    left = residual_left(pool, final) if final.size else None
     return SearchResult(
-        pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, alike
-    )
+        pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, left, evidence,
+        alike,
+    )  # fmt: skip
 
 
 # --- superfluous laws -------------------------------------------------------------------------
@@ -141,7 +165,7 @@ def _simpler_models(
         if not is_fitted:
             along = refine(stage, less.new, [known[other] for other in less.new])
             if along is not None and along.validation_cost <= most():
-                pool.attempt(model_for(pool.problem, chosen.fit, less))
+                pool.attempt(model_for(pool.problem, chosen.fit.model, less))
         yield from _converge_candidate(pool, less, chosen)
     yield from _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
 
@@ -243,7 +267,7 @@ def _rivals(pool: Pool, chosen: ValidatedModel) -> tuple[ValidatedModel, ...]:
     for other in sorted(pool.valid(), key=lambda model: model.cost):
         if other.size != chosen.size or other.families in (chosen.families, *rivals):
             continue
-        if not _is_degenerate(other, chosen) and pool.is_alike(other, chosen):
+        if not _is_degenerate(other, chosen) and pool.is_rival(other, chosen):
             rivals[other.families] = other
     return tuple(rivals.values())
 
@@ -269,7 +293,7 @@ def _superfluous_effects(pool: Pool, chosen: ValidatedModel) -> tuple[int, ...]:
             continue
         kept = tuple(j for j in reference.candidate.kept if j != i)
         candidate = Candidate(kept, reference.candidate.new)
-        result = pool.refit(model_for(problem, reference, candidate), FULL)
+        result = pool.refit(model_for(problem, reference.model, candidate), FULL)
         if result is not None and not pool.prefers(chosen, pool.validate(result)):
             superfluous.append(i)
     return tuple(superfluous)
@@ -326,7 +350,7 @@ def _with_memory_instead(
     candidate = chosen.fit.candidate.with_effects(law)
     if candidate == chosen.fit.candidate:
         return None
-    plain = chosen.fit._replace(model=chosen.fit.model.with_linear(linear))
+    plain = chosen.fit.model.with_linear(linear)
     for start in MAXWELL.starts(pool.problem.motions[strut]):
         first = model_for(pool.problem, plain, candidate, {law: np.array(start)})
         result = fit(pool.problem, first, free, FINAL)
@@ -460,50 +484,3 @@ def _contradicts_prior(problem: Problem, before: Array, after: Array, significan
         return True
     farther = np.sum((after / deviations) ** 2) - np.sum((before / deviations) ** 2)
     return bool(farther > significant**2)
-
-
-# --- rejected laws ----------------------------------------------------------------------------
-
-
-def _list_rejections(
-    first: Pool,
-    first_round: FirstRound,
-    linear: ValidatedModel,
-    chosen: ValidatedModel,
-    rivals: Sequence[ValidatedModel],
-) -> tuple[RejectedEffect, ...]:
-    """Laws that were not chosen, with the reason of each, best first."""
-    # As a share of the linear model: the first search may know the noise less well, or see a part.
-    share = chosen.cost / max(linear.cost, 1e-300)
-    rejected: dict[StrutEffect, RejectedEffect] = {}
-    chosen_laws = set(chosen.fit.candidate.new)
-    tied = {law for rival in rivals for law in rival.fit.candidate.new} - chosen_laws
-    for screening in first_round.screenings:
-        law = screening.laws[-1]
-        if law in chosen_laws or law in rejected:
-            continue
-        residual = float(np.sqrt(max(screening.share, 0.0)))
-        why = (
-            "these data cannot distinguish it from the chosen model"
-            if law in tied
-            else _reason_of_rejection(first, chosen.size, share, law, residual)
-        )
-        strut, name = first.problem.spec.struts[law[0]].name, law[1]
-        rejected[law] = RejectedEffect(effect(name).family, name, strut, why, min(residual, 1.0))
-    return tuple(sorted(rejected.values(), key=lambda r: 1.0 if r.left is None else r.left))
-
-
-def _reason_of_rejection(
-    first: Pool, laws: int, share: float, law: StrutEffect, residual: float
-) -> str:
-    candidate = nominal(first.problem).with_effects(law)
-    if candidate in first.invalid:
-        return first.invalid[candidate]
-    if candidate in first.fits and laws > 0:
-        alone = first.fits[candidate].cost / max(first.linear.cost, 1e-300)
-        ratio = float(np.sqrt(alone / max(share, 1e-300)))
-        if laws == 1:
-            return f"its out-of-sample residual is {ratio:.3g} times that of the chosen model"
-        return f"alone, its out-of-sample residual is {ratio:.3g} times that of the chosen model"
-    reduction = 100.0 * (1.0 - min(residual, 1.0))
-    return f"along the motion it reduces the residual of the linear model by {reduction:.3g} %"

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from dart_model.effects import effect
 from rig.diagnosis.numerics.least_squares import Effort
@@ -307,7 +308,7 @@ class Pool:
         share = 0.0 if larger.size == smaller.size > 0 else criteria.least_share
         gain = smaller.cost - larger.cost
         return (
-            gain > criteria.standard_errors * _standard_error(smaller, larger)
+            gain > criteria.standard_errors * standard_error(smaller, larger)
             and gain > criteria.least_likelihood_gain
             and gain > share * smaller.excess
         )
@@ -357,9 +358,14 @@ class Pool:
         return model.cost <= self.criteria.hopeless * best.cost
 
     def is_alike(self, other: ValidatedModel, best: ValidatedModel) -> bool:
-        """Whether the data cannot distinguish a model from the best one."""
+        """Whether a model is as good as the best one, so that the plainer is taken."""
         loss = other.cost - best.cost
-        return loss <= self.criteria.standard_errors * _standard_error(other, best)
+        return loss <= self.criteria.standard_errors * standard_error(other, best)
+
+    def is_rival(self, other: ValidatedModel, best: ValidatedModel) -> bool:
+        """Whether the data cannot distinguish a model from the best one."""
+        errors = float(student.isf(self.criteria.level, len(best.block_costs) - 1))
+        return other.cost - best.cost <= errors * standard_error(other, best)
 
 
 def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
@@ -371,7 +377,7 @@ def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
     )
 
 
-def _standard_error(a: ValidatedModel, b: ValidatedModel) -> float:
+def standard_error(a: ValidatedModel, b: ValidatedModel) -> float:
     """Standard error of the difference of two out-of-sample sums over blocks."""
     difference = a.block_costs - b.block_costs
     return float(np.sqrt(len(difference)) * np.std(difference, ddof=1))

@@ -213,7 +213,7 @@ def _response(base: _Base, candidate: Candidate, at: StrutEffect, values: Array)
     None where the model runs away.
     """
     residual = whiten_residual(
-        base.problem, model_for(base.problem, base.fit, candidate, {at: values})
+        base.problem, model_for(base.problem, base.fit.model, candidate, {at: values})
     )
     if residual is None:
         return None
@@ -229,7 +229,7 @@ def _change(
     base: _Base, candidate: Candidate, at: StrutEffect, values: Array, explained: Array
 ) -> ModelChange:
     rest = base.residual - explained
-    model = model_for(base.problem, base.fit, candidate, {at: values})
+    model = model_for(base.problem, base.fit.model, candidate, {at: values})
     return ModelChange(model, float(rest @ rest))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from dart_model.effects import AMBIENT_C, FAMILY_WORDS, Effect, effect
 from dart_model.effects.calling import force_over_arrays
-from rig.diagnosis.outcome import BeforeAfter, Diagnosis, FoundEffect, LinearCorrection, Result
+from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection, ModelErrors, Result
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.number_formats import (
     capital,
@@ -113,7 +113,7 @@ def remainder(diagnosis: Diagnosis) -> Statement:
     return Statement(tone, sign, text)
 
 
-def _deciding(diagnosis: Diagnosis) -> tuple[BeforeAfter, float]:
+def _deciding(diagnosis: Diagnosis) -> tuple[ModelErrors, float]:
     """The error that decides, and its noise floor."""
     held_out, floor = diagnosis.held_out, diagnosis.noise_floor
     if is_prescribed(diagnosis):
@@ -122,7 +122,10 @@ def _deciding(diagnosis: Diagnosis) -> tuple[BeforeAfter, float]:
 
 
 def _headline(diagnosis: Diagnosis) -> str:
-    names = [_bare(effect(item.name).words) for item in missing(diagnosis)]
+    names = [
+        _bare(effect(item.name).words) + " (a candidate)" * item.is_candidate
+        for item in missing(diagnosis)
+    ]
     match diagnosis.verdict:
         case "nothing_missing":
             return "Nothing is missing"
@@ -133,6 +136,8 @@ def _headline(diagnosis: Diagnosis) -> str:
         case "ambiguous":
             rivals = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
             either = join_words(names, "and") or "linear corrections"
+            if not rivals and any(item.is_candidate for item in diagnosis.effects):
+                return f"{capital(either)} missing"
             others = join_words(rivals, "or") or "another law that fits as well"
             return f"{capital(either)}, or {others}"
         case _:
@@ -140,7 +145,7 @@ def _headline(diagnosis: Diagnosis) -> str:
     if names:
         also = " and more" if diagnosis.verdict == "partly_explained" else ""
         return f"{capital(join_words(names, 'and'))}{also} missing"
-    parts = [_direction(item) for item in diagnosis.linear]
+    parts = [_direction(item) for item in diagnosis.linear if _differs(item)]
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
     parts += [
         f"{item.channel} {'late' if item.parameter == 'delay_s' else 'with a wrong gain'}"
@@ -165,6 +170,12 @@ def _direction(item: LinearCorrection) -> str:
         share = 100.0 * abs(change / item.nominal)
         amount = with_unit(number(share, decimals_of(share) if share else 0), "%")
     return f"{name} {amount} {more if change > 0.0 else less} than in the model"
+
+
+def _differs(item: LinearCorrection) -> bool:
+    """Whether a correction's interval excludes the value of the model file."""
+    low, high = item.total.low, item.total.high
+    return low is None or high is None or not low <= item.nominal <= high
 
 
 def _values(diagnosis: Diagnosis) -> tuple[str, ...]:

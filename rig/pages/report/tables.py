@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from dart_model.effects import CATALOGUE, Effect, effect
 from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
-from rig.diagnosis.outcome import BeforeAfter, ChannelCorrection, Diagnosis, Estimate, RunFigures
+from rig.diagnosis.outcome import ChannelCorrection, Diagnosis, Estimate, ModelErrors, RunFigures
 from rig.pages.number_formats import (
     change,
     label,
@@ -15,7 +15,14 @@ from rig.pages.number_formats import (
     value_and_interval,
     with_unit,
 )
-from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
+from rig.pages.report.words import (
+    LINEAR,
+    difference,
+    evidence_words,
+    is_prescribed,
+    linear_label,
+    missing,
+)
 
 Row = tuple[str, ...]
 """Texts of the cells of a row."""
@@ -30,7 +37,10 @@ class EffectTable(NamedTuple):
 
 
 def errors(diagnosis: Diagnosis) -> tuple[Row, ...]:
-    """Name, before, after, change, noise floor and ratio of each error that was measured."""
+    """Name, nominal, best linear and corrected model, change, noise floor and ratio of each error.
+
+    Each is followed by its shares of the signal.
+    """
     held_out, floor = diagnosis.held_out, diagnosis.noise_floor
     cell = "Strut force against the load cell"
     if is_prescribed(diagnosis):
@@ -43,11 +53,24 @@ def errors(diagnosis: Diagnosis) -> tuple[Row, ...]:
             ("Residual force", held_out.residual_force_rmse_n, floor.residual_force_rmse_n, "N"),
             (cell, held_out.strut_force_rmse_n, math.nan, "N"),
         )
-    return tuple(
-        (name, *_pair(x, unit), change(x), quantity(least, unit), ratio(x.after, least))
-        for name, x, least, unit in rows
-        if x is not None and math.isfinite(x.before)
-    )
+    texts: list[Row] = []
+    for name, x, least, unit in rows:
+        if x is None or not math.isfinite(x.before):
+            continue
+        over = ratio(x.after, least)
+        texts.append((name, *_each(x, unit), change(x), quantity(least, unit), over))
+        if x.signal > 0.0:
+            shares = (_share(it / x.signal) for it in (x.before, x.linear, x.after))
+            signal = f"as a share of the signal, {quantity(x.signal, unit)} RMS"
+            texts.append((signal, *shares, "", _share(least / x.signal), ""))
+    return tuple(texts)
+
+
+def _share(share: float) -> str:
+    """A share in per cent, with two digits that count."""
+    if not math.isfinite(share):
+        return "–"
+    return percent(share, min(max(1 - math.floor(math.log10(100.0 * share)), 0), 4) if share else 0)
 
 
 class Bar(NamedTuple):
@@ -63,14 +86,12 @@ _RIVALS = 3
 
 
 def bars(diagnosis: Diagnosis) -> tuple[Bar, ...]:
-    """Residual forces of nominal, best linear and chosen model and of the nearest rivals.
+    """Residuals of the best linear and the chosen model and of the nearest rivals.
 
-    As shares of that of the best linear model; none where that is not known.
+    As shares of that of the best linear model; none where no law is chosen.
     """
-    held_out = diagnosis.held_out
-    linear_n, force = held_out.linear_residual_force_rmse_n, held_out.residual_force_rmse_n
     lacking = missing(diagnosis)
-    if not (linear_n > 0.0 and math.isfinite(force.after) and lacking):
+    if diagnosis.left is None or not lacking:
         return ()
     rivals = [
         Bar(effect(item.name).words, "rival", item.left)
@@ -79,28 +100,28 @@ def bars(diagnosis: Diagnosis) -> tuple[Bar, ...]:
     ][:_RIVALS]
     words = " and ".join(effect(item.name).words for item in lacking)
     return (
-        Bar("nominal model", "given", force.before / linear_n),
         Bar("best linear model", "given", 1.0),
         *rivals[::-1],
-        Bar(f"chosen: {words}", "chosen", force.after / linear_n),
+        Bar(f"chosen: {words}", "chosen", diagnosis.left),
     )
 
 
 def run_columns(diagnosis: Diagnosis) -> Row:
-    """Heads of the pairs of columns of `run_cells`."""
+    """Heads of the columns of `run_cells`, of which each has three."""
     return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(diagnosis) :]
 
 
 def run_cells(run: RunFigures, columns: int) -> Row:
-    """Errors on one held-out run: the last columns, before and after."""
-    heights, forces = _pair(run.height_rmse_m, "m"), _pair(run.residual_force_rmse_n, "N")
-    return (*heights, *forces, *_pair(run.strut_force_rmse_n, "N"))[-2 * columns :]
+    """Errors on one held-out run: the last columns, of nominal, linear and corrected model."""
+    heights, forces = _each(run.height_rmse_m, "m"), _each(run.residual_force_rmse_n, "N")
+    return (*heights, *forces, *_each(run.strut_force_rmse_n, "N"))[-3 * columns :]
 
 
-def _pair(figure: BeforeAfter | None, unit: str) -> tuple[str, str]:
-    if figure is None:
-        return "–", "–"
-    return quantity(figure.before, unit), quantity(figure.after, unit)
+def _each(errors: ModelErrors | None, unit: str) -> tuple[str, str, str]:
+    if errors is None:
+        return "–", "–", "–"
+    before, linear, after = errors.before, errors.linear, errors.after
+    return quantity(before, unit), quantity(linear, unit), quantity(after, unit)
 
 
 def linear(diagnosis: Diagnosis) -> tuple[Row, ...]:
@@ -137,6 +158,8 @@ def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
             f"explains {percent(item.explained_fraction, 0)} of the residual force without it"
             f"{overlap}"
         )
+        if item.evidence is not None:
+            note += f". {evidence_words(item.evidence)}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))
     return tuple(tables)
 

@@ -8,11 +8,14 @@ from rig.diagnosis.outcome import (
     ChannelCorrection,
     Diagnosis,
     Estimate,
+    Evidence,
     FoundEffect,
+    LikelihoodGain,
     LinearCorrection,
 )
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.number_formats import (
+    capital,
     decimals_of,
     label,
     number,
@@ -41,6 +44,13 @@ _AS_EFFECT = {
 
 _OF_CHANNELS = {"delay_s": "delay", "gain": "input_gain"}
 """Effects that stand for corrections of channels."""
+
+CONFIRMATIONS = {
+    "confirmed": "held-out data confirm it",
+    "not_exercised": "held-out data do not exercise it",
+    "contradicted": "held-out data contradict it",
+}
+"""What held-out data say of an effect."""
 
 BLOCKS = "blocks of the recordings, spread over them, were held out"
 
@@ -133,15 +143,22 @@ def sentence(diagnosis: Diagnosis, struts: int) -> str:
                 f"{_error_falls(diagnosis)}"
             )
         case "ambiguous":
-            others = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
-            rivals = join_words(others, "or") or "another effect that fits as well"
-            hint, error = _excitation_hint(diagnosis), _error_falls(diagnosis, "the former")
-            return (
-                f"{_finding(diagnosis, struts)}, or else {rivals}; these recordings do not "
-                f"distinguish them{hint}; {error}"
-            )
+            return _ambiguous(diagnosis, struts)
         case "not_explained":
             return _not_explained(diagnosis)
+
+
+def _ambiguous(diagnosis: Diagnosis, struts: int) -> str:
+    others = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
+    if not others and any(item.is_candidate for item in diagnosis.effects):
+        hint = _excitation_hint(diagnosis, "to confirm it")
+        return f"{_finding(diagnosis, struts)}{hint}; {_error_falls(diagnosis)}"
+    rivals = join_words(others, "or") or "another effect that fits as well"
+    hint, error = _excitation_hint(diagnosis), _error_falls(diagnosis, "the former")
+    return (
+        f"{_finding(diagnosis, struts)}, or else {rivals}; these recordings do not "
+        f"distinguish them{hint}; {error}"
+    )
 
 
 def _finding(diagnosis: Diagnosis, struts: int) -> str:
@@ -196,7 +213,26 @@ def _effect(item: FoundEffect, struts: int) -> str:
             value, interval = value_and_interval(item.parameters[parameter.name], parameter.unit)
             parts.append(f"{label(parameter)} {value} (95 %: {interval})")
     described = f", {' and '.join(parts)}" if parts else ""
-    return f"{law.words}{_where(item.strut, struts)}{described}"
+    doubt = ""
+    if item.evidence is not None and item.is_candidate:
+        doubt = f" (a candidate: {CONFIRMATIONS[item.evidence.held_out]})"
+    return f"{law.words}{_where(item.strut, struts)}{described}{doubt}"
+
+
+def evidence_words(evidence: Evidence) -> str:
+    """How much an effect gains on data left out of fits, and what held-out data say of it."""
+    error = "the error on blocks left out of the fit is"
+    text = f"Without it {error} {_gain(evidence.without)}"
+    if evidence.rival is not None:
+        laws = join_words([effect(name).words for name in evidence.rival.over], "and")
+        text += f"; with the nearest other explanation ({laws}) it is {_gain(evidence.rival)}"
+    return f"{text}. {capital(CONFIRMATIONS[evidence.held_out])}"
+
+
+def _gain(gain: LikelihoodGain) -> str:
+    errors = gain.log_likelihood / gain.standard_error if gain.standard_error > 0.0 else math.inf
+    sure = number(errors, 0 if abs(errors) >= 10.0 else 1)
+    return f"{times(gain.error_ratio)} times as large, by {sure} standard errors"
 
 
 def _linear(item: LinearCorrection, struts: int) -> str:
@@ -253,13 +289,13 @@ def _or_else(diagnosis: Diagnosis) -> str:
     return f"; it could also be {others}{_excitation_hint(diagnosis)}"
 
 
-def _excitation_hint(diagnosis: Diagnosis) -> str:
+def _excitation_hint(diagnosis: Diagnosis, purpose: str = "to distinguish them") -> str:
     # The excitation is a phrase or a sentence; here it is part of one.
     bare = (diagnosis.suggested_excitation or "").strip().rstrip(".")
     if not bare:
         return ""
     clause = bare if bare[1:2].isupper() else bare[:1].lower() + bare[1:]
-    return f" (to distinguish them: {clause})"
+    return f" ({purpose}: {clause})"
 
 
 def _not_explained(diagnosis: Diagnosis) -> str:

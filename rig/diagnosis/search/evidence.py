@@ -1,0 +1,91 @@
+"""How much better data that were left out of a fit are described with a law than without it.
+
+Reference: Stone, Cross-validatory choice and assessment of statistical predictions, J. R. Stat.
+Soc. B 36 (1974).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dart_model.effects import effect
+from rig.diagnosis.outcome import LikelihoodGain
+from rig.diagnosis.problem.problem import StrutEffect
+from rig.diagnosis.search.fit import model_for
+from rig.diagnosis.search.pool import Pool, ValidatedModel, standard_error
+
+
+class LeftOutGains(NamedTuple):
+    """Gains by a law: over the best model of the others, and over the best without its family."""
+
+    without: LikelihoodGain
+    rival: LikelihoodGain | None
+
+
+def weigh_laws(
+    pool: Pool, first: Pool, single: Sequence[StrutEffect], chosen: ValidatedModel
+) -> dict[StrutEffect, LeftOutGains]:
+    """The gains by each law of a model; models that it takes and that were not fitted yet are.
+
+    `first` are models of a search about the linear one, and `single` are its single laws, best
+    along the motion first.
+    """
+    return {law: _weigh(pool, first, single, chosen, law) for law in chosen.fit.candidate.new}
+
+
+def _weigh(
+    pool: Pool,
+    first: Pool,
+    single: Sequence[StrutEffect],
+    chosen: ValidatedModel,
+    law: StrutEffect,
+) -> LeftOutGains:
+    less = chosen.fit.candidate.without(law)
+    if less not in pool.fits:
+        pool.attempt(model_for(pool.problem, chosen.fit.model, less))
+    kept = set(less.new)
+    subsets = [m for m in pool.fits.values() if set(m.fit.candidate.new) <= kept]
+    earlier = _nearest_rival(first, chosen, law)
+    if earlier is not None and earlier.fit.candidate not in pool.fits:
+        pool.adopt(earlier.fit)
+    elif earlier is None and chosen.size == 1:
+        others = (at for at in single if _family(at) != _family(law))
+        if (next_best := next(others, None)) is not None:
+            pool.screen_and_attempt([next_best])
+    rival = _nearest_rival(pool, chosen, law)
+    if rival is not None:
+        pool.converge(rival, chosen)
+        rival = _nearest_rival(pool, chosen, law)
+    return LeftOutGains(
+        _gain(chosen, min(subsets, key=lambda model: model.cost)),
+        None if rival is None else _gain(chosen, rival),
+    )
+
+
+def _nearest_rival(pool: Pool, chosen: ValidatedModel, law: StrutEffect) -> ValidatedModel | None:
+    """The best model that has other laws, and none of a law's family in its strut."""
+    others = set(chosen.fit.candidate.new) - {law}
+    rivals = (
+        model
+        for model in pool.valid()
+        if 0 < model.size <= chosen.size
+        and not set(model.fit.candidate.new) <= others
+        and _family(law) not in map(_family, model.fit.candidate.new)
+    )
+    return min(rivals, key=lambda model: model.cost, default=None)
+
+
+def _family(law: StrutEffect) -> StrutEffect:
+    """Strut and family of a law."""
+    return law[0], effect(law[1]).family
+
+
+def _gain(chosen: ValidatedModel, other: ValidatedModel) -> LikelihoodGain:
+    level = max(1.0, chosen.cost / chosen.fit.rows)
+    return LikelihoodGain(
+        tuple(name for _, name in other.fit.candidate.new),
+        0.5 * (other.cost - chosen.cost) / level,
+        0.5 * standard_error(other, chosen) / level,
+        float(np.sqrt(other.cost / chosen.cost)),
+    )

@@ -1,0 +1,95 @@
+"""Laws that were not chosen: what each leaves of the residual, and one reason that agrees."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dart_model.effects import effect
+from rig.diagnosis.outcome import RejectedEffect
+from rig.diagnosis.problem.problem import StrutEffect, nominal
+from rig.diagnosis.search.explore import FirstRound
+from rig.diagnosis.search.pool import Pool, ValidatedModel
+from rig.diagnosis.search.screen import Screening
+
+_NEAR = 1.1
+"""Ratio of two residuals up to which it is stated with a further digit."""
+_TIED = "these data cannot distinguish it from the chosen model"
+
+
+def residual_left(pool: Pool, model: ValidatedModel) -> float:
+    """RMS residual of a model, out of sample, as a share of that of the best linear model."""
+    return min(float(np.sqrt(model.cost / max(pool.linear.cost, 1e-300))), 1.0)
+
+
+def list_rejections(
+    pool: Pool,
+    first: Pool,
+    first_round: FirstRound,
+    chosen: ValidatedModel,
+    rivals: Sequence[ValidatedModel],
+) -> tuple[RejectedEffect, ...]:
+    """Laws that were not chosen, best first; `first` are models of the search about no law."""
+    screenings, laws = first_round.screenings, set(chosen.fit.candidate.new)
+    tied = {law for rival in rivals for law in rival.fit.candidate.new}
+    best = min(screenings, key=lambda screening: screening.share, default=None)
+    rejected: dict[StrutEffect, RejectedEffect] = {}
+    for screening in screenings:
+        law = screening.laws[-1]
+        if law in laws or law in rejected:
+            continue
+        source = _fitted_in(pool, first, chosen, law)
+        if source is None:
+            left, why = _along_motion(screening, best)
+        else:
+            left, why = _in_simulation(pool, source, chosen, law)
+        (strut, name), spec = law, pool.problem.spec
+        rejected[law] = RejectedEffect(
+            effect(name).family,
+            name,
+            spec.struts[strut].name,
+            _TIED if law in tied else why,
+            left,
+        )
+    return tuple(sorted(rejected.values(), key=lambda item: item.left or 0.0))
+
+
+def _fitted_in(pool: Pool, first: Pool, chosen: ValidatedModel, law: StrutEffect) -> Pool | None:
+    """The models among which a law alone was fitted in simulation.
+
+    One that seems as good as the chosen model, which the first search cannot tell, is fitted again.
+    """
+    candidate = nominal(pool.problem).with_effects(law)
+    if candidate in pool.fits or candidate not in first.fits:
+        return pool if candidate in pool.fits else None
+    model = first.fits[candidate]
+    if candidate in first.invalid or residual_left(first, model) > residual_left(pool, chosen):
+        return first
+    pool.adopt(model.fit)
+    return pool if candidate in pool.fits else first
+
+
+def _in_simulation(
+    pool: Pool, source: Pool, chosen: ValidatedModel, law: StrutEffect
+) -> tuple[float, str]:
+    candidate = nominal(pool.problem).with_effects(law)
+    model = source.fits[candidate]
+    left, least = residual_left(source, model), residual_left(pool, chosen)
+    if candidate in source.invalid:
+        return left, source.invalid[candidate]
+    if not chosen.size:
+        if pool.at_floor(chosen):
+            return left, "without any law the residual is at the noise floor"
+        return left, f"it reduces the residual of the linear model by {100.0 * (1.0 - left):.3g} %"
+    alone = "alone, " if chosen.size > 1 else ""
+    if left > least:
+        ratio = f"{left / least:.4g}" if left < _NEAR * least else f"{left / least:.3g}"
+        return left, f"{alone}its residual is {ratio} times that of the chosen model"
+    return left, "its residual is not significantly smaller than that of the chosen model"
+
+
+def _along_motion(screening: Screening, best: Screening | None) -> tuple[float, str]:
+    left = min(float(np.sqrt(max(screening.share, 0.0))), 1.0)
+    if best is None or best is screening:
+        return left, "along the motion it reduces the residual too little to be fitted"
+    words, least = effect(best.laws[-1][1]).words, float(np.sqrt(max(best.share, 0.0)))
+    return left, f"along the motion {words} leaves less: {100.0 * least:.3g} %"

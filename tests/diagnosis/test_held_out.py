@@ -1,0 +1,120 @@
+"""What held-out data say of the laws of a model, and which laws they take back."""
+
+import math
+
+import pytest
+
+from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.evaluate import HeldOutLaw
+from rig.diagnosis.outcome import ModelErrors, NoiseFloor, RunFigures
+from rig.diagnosis.problem.problem import RunEvaluation
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.verdict import confirmation, find_reason_against_laws
+from tests.diagnosis import little_bench as bench
+
+FLOOR_M = 1e-5
+LAW = (0, "coulomb_friction")
+CONFIRMED, IDLE = HeldOutLaw(1e4, 9e3), HeldOutLaw(3.0, -1.0)
+
+
+class Stop(bench.Nothing):
+    """An end stop that the full load reaches."""
+
+    at, stiffness = 0.383, 9e4
+
+    def force(self, t, z, v, state):
+        return -self.stiffness * max(z - self.at, 0.0)
+
+
+def gentle(t):
+    return 0.3 * bench.load_n(t)
+
+
+@pytest.mark.parametrize(
+    ("law", "expected"),
+    [
+        (HeldOutLaw(29.0, 29.0), "not_exercised"),
+        (HeldOutLaw(31.0, 12.0), "confirmed"),
+        (HeldOutLaw(math.inf, math.inf), "confirmed"),
+        (HeldOutLaw(500.0, -4.0), "contradicted"),
+    ],
+)
+def test_a_law_counts_as_what_held_out_data_show_of_it(law, expected):
+    assert confirmation(law, CRITERIA) == expected
+
+
+class Fitted:
+    """A linear fit far above the floor of what was learnt from."""
+
+    mean_square, model = 1e4, None
+
+
+class Learnt:
+    def floor_level(self, model):
+        return 1.0
+
+
+def reason(after_m, linear_m, laws, after_n=1.0, linear_n=1.0):
+    heights = ModelErrors(5e-3, linear_m, after_m, 1e-2)
+    forces = ModelErrors(5.0, linear_n, after_n, 10.0)
+    run = RunEvaluation(RunFigures("run", heights, forces, None), NoiseFloor(FLOOR_M, 0.1), 0.0, ())
+    return find_reason_against_laws(Learnt(), Fitted(), [run], laws, CRITERIA)
+
+
+def test_laws_that_lose_to_the_best_linear_model_are_taken_back():
+    assert reason(4e-4, 1e-3, {LAW: CONFIRMED}) is None
+    why = reason(2e-3, 1e-3, {LAW: CONFIRMED})
+    assert why is not None
+    assert "2 times" in why
+
+
+def test_laws_that_held_out_data_do_not_exercise_lose_nothing():
+    assert reason(1.001e-3, 1e-3, {LAW: IDLE}) is None
+
+
+def test_where_heights_drift_the_force_decides():
+    assert reason(1.1e-3, 1e-3, {LAW: CONFIRMED}, after_n=0.5) is None
+    assert reason(1.3e-3, 1e-3, {LAW: CONFIRMED}, after_n=0.5) is not None
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    return [bench.run(Stop(), seed=1, duration_s=20.0)]
+
+
+@pytest.mark.slow
+def test_a_stop_that_held_out_runs_reach_is_confirmed_and_weighed(learnt):
+    held_out = bench.run(Stop(), seed=2, duration_s=20.0)
+    found = diagnose(bench.model(), learnt, [held_out]).diagnosis
+    assert found.verdict == "explained"
+    (effect,) = found.effects
+    assert effect.family == "stop"
+    assert effect.evidence.held_out == "confirmed"
+    assert not effect.is_candidate
+    assert effect.evidence.held_out_log_likelihood > 15.0
+    without = effect.evidence.without
+    assert without.over == ()
+    assert without.error_ratio > 2.0
+    assert without.log_likelihood > 3.0 * without.standard_error
+    rival = effect.evidence.rival
+    assert rival is not None
+    assert 1.0 < rival.error_ratio <= without.error_ratio * 1.01
+    heights = found.held_out.height_rmse_m
+    assert heights.after < 0.5 * heights.linear
+    assert heights.linear <= heights.before
+    assert 1e-3 < heights.signal < 0.1
+    assert found.left == pytest.approx(1.0 / without.error_ratio, rel=0.05)
+    assert all(item.left >= found.left for item in found.rejected if item.left is not None)
+
+
+@pytest.mark.slow
+def test_a_stop_that_no_held_out_run_reaches_is_a_candidate(learnt):
+    held_out = bench.run(Stop(), seed=2, duration_s=20.0, load=gentle)
+    found = diagnose(bench.model(), learnt, [held_out]).diagnosis
+    (effect,) = found.effects
+    assert effect.family == "stop"
+    assert effect.evidence.held_out == "not_exercised"
+    assert effect.is_candidate
+    assert found.verdict == "ambiguous"
+    assert found.ambiguous_with == ()
+    assert found.suggested_excitation
