@@ -89,14 +89,13 @@ class LikelihoodGain:
         over: Effects of the other model; none are those of the best linear model.
         log_likelihood: Gain of its logarithm; the noise is what the corrected model leaves, at
             least the sensors'.
-        standard_error: Of that, from the blocks' scatter.
-        error_ratio: RMS residual of the other model over that of the corrected one.
+        error_ratio: RMS residual of the other model over that of the corrected one; it is beyond
+            each end with the level at which rivals are distinguished.
     """
 
     over: tuple[str, ...]
     log_likelihood: float
-    standard_error: float
-    error_ratio: float
+    error_ratio: Estimate
 
 
 @dataclass(frozen=True)

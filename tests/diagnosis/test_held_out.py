@@ -94,16 +94,17 @@ def test_a_stop_that_held_out_runs_reach_is_confirmed_and_weighed(learnt):
     assert effect.evidence.held_out_log_likelihood > 15.0
     without = effect.evidence.without
     assert without.over == ()
-    assert without.error_ratio > 2.0
-    assert without.log_likelihood > 3.0 * without.standard_error
+    assert without.error_ratio.value > 2.0
+    assert 1.0 < without.error_ratio.low < without.error_ratio.value < without.error_ratio.high
+    assert without.log_likelihood > 100.0
     rival = effect.evidence.rival
     assert rival is not None
-    assert 1.0 < rival.error_ratio <= without.error_ratio * 1.01
+    assert 1.0 < rival.error_ratio.low < rival.error_ratio.value <= without.error_ratio.value * 1.01
     heights = found.held_out.height_rmse_m
     assert heights.after < 0.5 * heights.linear
     assert heights.linear <= heights.before
     assert 1e-3 < heights.signal < 0.1
-    assert found.left == pytest.approx(1.0 / without.error_ratio, rel=0.05)
+    assert found.left == pytest.approx(1.0 / without.error_ratio.value, rel=0.05)
     assert all(item.left >= found.left for item in found.rejected if item.left is not None)
 
 

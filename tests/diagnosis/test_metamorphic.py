@@ -360,7 +360,6 @@ def test_a_later_time_changes_nothing(case):
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="far from time zero phase and frequency are one to the fit")
 def test_a_later_time_changes_a_periodic_force_in_its_phase_only():
     one = answer("ripple").diagnosis
     train, test = (shifted(record, 1e4) for record in recordings("ripple"))

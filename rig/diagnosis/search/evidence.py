@@ -7,13 +7,11 @@ Soc. B 36 (1974).
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from dart_model.effects import effect
-from rig.diagnosis.outcome import LikelihoodGain
+from rig.diagnosis.outcome import Estimate, LikelihoodGain
 from rig.diagnosis.problem.problem import StrutEffect
 from rig.diagnosis.search.fit import model_for
-from rig.diagnosis.search.pool import Pool, ValidatedModel, standard_error
+from rig.diagnosis.search.pool import Pool, ValidatedModel, error_ratio
 
 
 class LeftOutGains(NamedTuple):
@@ -58,8 +56,8 @@ def _weigh(
         pool.converge(rival, chosen)
         rival = _nearest_rival(pool, chosen, law)
     return LeftOutGains(
-        _gain(chosen, min(subsets, key=lambda model: model.cost)),
-        None if rival is None else _gain(chosen, rival),
+        _gain(pool, chosen, min(subsets, key=lambda model: model.cost)),
+        None if rival is None else _gain(pool, chosen, rival),
     )
 
 
@@ -81,11 +79,10 @@ def _family(law: StrutEffect) -> StrutEffect:
     return law[0], effect(law[1]).family
 
 
-def _gain(chosen: ValidatedModel, other: ValidatedModel) -> LikelihoodGain:
+def _gain(pool: Pool, chosen: ValidatedModel, other: ValidatedModel) -> LikelihoodGain:
     level = max(1.0, chosen.cost / chosen.fit.rows)
     return LikelihoodGain(
         tuple(name for _, name in other.fit.candidate.new),
         0.5 * (other.cost - chosen.cost) / level,
-        0.5 * standard_error(other, chosen) / level,
-        float(np.sqrt(other.cost / chosen.cost)),
+        Estimate(*error_ratio(other, chosen, pool.criteria.level)),
     )

@@ -4,6 +4,7 @@ Reference: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees
 one-standard-error rule.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -55,6 +56,8 @@ FINAL = Effort(15, 1e-6, 2)
 """The fit that is reported; that of a free run once more with finer steps."""
 
 
+_TINY = 1e-100
+"""Least divisor."""
 _REVERSING = 0.02
 """Velocity, as a share of its RMS, below which friction changes its sign."""
 
@@ -364,8 +367,7 @@ class Pool:
 
     def is_rival(self, other: ValidatedModel, best: ValidatedModel) -> bool:
         """Whether the data cannot distinguish a model from the best one."""
-        errors = float(student.isf(self.criteria.level, len(best.block_costs) - 1))
-        return other.cost - best.cost <= errors * standard_error(other, best)
+        return error_ratio(other, best, self.criteria.level).low <= 1.0
 
 
 def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
@@ -375,6 +377,29 @@ def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
     return few < many and (
         (old <= STORING and new <= DISSIPATING) or (old <= DISSIPATING and new <= STORING)
     )
+
+
+class Ratio(NamedTuple):
+    """Ratio of two models' RMS residuals out of sample, and the ends of its interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def error_ratio(other: ValidatedModel, best: ValidatedModel, level: float) -> Ratio:
+    """RMS residual of a model over that of another; beyond each end with a probability of `level`.
+
+    The scatter is that of the logarithm when each block is left out (jackknife): a stop that is
+    reached in few blocks makes the sums of squares scatter as much as they differ.
+    """
+    costs = [model.cost - model.block_costs for model in (other, best)]
+    logs = 0.5 * np.log(np.maximum(costs[0], _TINY) / np.maximum(costs[1], _TINY))
+    blocks = len(logs)
+    error = float(np.sqrt((blocks - 1) * np.var(logs)))
+    half = float(student.isf(level, blocks - 1)) * error
+    value = float(np.sqrt(other.cost / best.cost))
+    return Ratio(value, value * math.exp(-half), value * math.exp(half))
 
 
 def standard_error(a: ValidatedModel, b: ValidatedModel) -> float:

@@ -13,6 +13,8 @@ from rig.diagnosis.search.screen import Screening
 
 _NEAR = 1.1
 """Ratio of two residuals up to which it is stated with a further digit."""
+_SAME = 1.0005
+"""Ratio up to which two residuals are the same."""
 _TIED = "these data cannot distinguish it from the chosen model"
 
 
@@ -80,11 +82,12 @@ def _in_simulation(
         if pool.at_floor(chosen):
             return left, "without any law the residual is at the noise floor"
         return left, f"it reduces the residual of the linear model by {100.0 * (1.0 - left):.3g} %"
+    if left < _SAME * least:
+        is_plainer = len(model.fit.parts.effects) <= len(chosen.fit.parts.effects)
+        return left, f"it fits no better{'' if is_plainer else ', with more parameters'}"
     alone = "alone, " if chosen.size > 1 else ""
-    if left > least:
-        ratio = f"{left / least:.4g}" if left < _NEAR * least else f"{left / least:.3g}"
-        return left, f"{alone}its residual is {ratio} times that of the chosen model"
-    return left, "its residual is not significantly smaller than that of the chosen model"
+    ratio = f"{left / least:.3f}" if left < _NEAR * least else f"{left / least:.3g}"
+    return left, f"{alone}its residual is {ratio} times that of the chosen model"
 
 
 def _along_motion(screening: Screening, best: Screening | None) -> tuple[float, str]:

@@ -230,9 +230,9 @@ def evidence_words(evidence: Evidence) -> str:
 
 
 def _gain(gain: LikelihoodGain) -> str:
-    errors = gain.log_likelihood / gain.standard_error if gain.standard_error > 0.0 else math.inf
-    sure = number(errors, 0 if abs(errors) >= 10.0 else 1)
-    return f"{times(gain.error_ratio)} times as large, by {sure} standard errors"
+    ratio = gain.error_ratio
+    low, high = (math.nan if end is None else end for end in (ratio.low, ratio.high))
+    return f"{times(ratio.value)} times as large ({times(low)} to {times(high)})"
 
 
 def _linear(item: LinearCorrection, struts: int) -> str:
