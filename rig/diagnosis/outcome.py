@@ -17,6 +17,8 @@ Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous
 Change = Literal["refitted", "superfluous"]
 Confirmation = Literal["confirmed", "not_exercised", "contradicted"]
 
+IMPROBABLE = 4.0
+"""Standard deviations of the model file's values beyond which one in some ten thousand lies."""
 _FOUR_DEVIATIONS = 2.0
 """In halves of a 95 % interval."""
 SCHEMA = 1
@@ -44,6 +46,8 @@ class LinearCorrection:
         nominal: Its value in the model file, the preload about mid-stroke.
         total: Its value by the data.
         about_height_m: Mid-stroke, about which stiffness and preload are taken; else None.
+        deviations: Distance of the two in standard deviations of the nominal value: those that the
+            model file states, or usual ones.
     """
 
     strut: str
@@ -51,6 +55,12 @@ class LinearCorrection:
     nominal: float
     total: Estimate
     about_height_m: float | None
+    deviations: float = 0.0
+
+    @property
+    def is_improbable(self) -> bool:
+        """Whether the model file is unlikely to be as far off."""
+        return abs(self.deviations) > IMPROBABLE
 
 
 @dataclass(frozen=True)

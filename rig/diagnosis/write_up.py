@@ -13,6 +13,7 @@ from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
+    IMPROBABLE,
     ChannelCorrection,
     Diagnosis,
     Estimate,
@@ -213,6 +214,7 @@ def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[Linea
                 nominal_value,
                 estimates.estimate(variable, nominal_value),
                 mid_stroke_m(problem.motions[p.strut]) if about else None,
+                float(estimates.fit.solution.values[variable]) / p.deviation,
             )
         )
     return tuple(corrections)
@@ -544,16 +546,16 @@ def _notes_of_zero_and_gain(problem: Problem, estimates: FitEstimates) -> tuple[
 
 
 def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
-    """Corrections that are far beyond what the model file states of its accuracy."""
+    """Corrections that are far beyond the accuracy that the model file states, or a usual one."""
     notes: list[str] = []
-    stated = problem.spec.tolerance
     for parameter, change in zip(problem.linear, result.parts.linear, strict=True):
-        times = abs(float(change)) / parameter.deviation
-        if times > _FAR and getattr(stated, PARAMETERS[parameter.kind], None) is not None:
+        times, key = abs(float(change)) / parameter.deviation, PARAMETERS[parameter.kind]
+        is_stated = getattr(problem.spec.tolerance, key, None) is not None
+        if times > (_FAR if is_stated else IMPROBABLE):
+            known = "that the model file states" if is_stated else "of usual model files"
             notes.append(
-                f"The correction of {PARAMETERS[parameter.kind]} is {times:.2g} times the standard "
-                "deviation that the model file states: is its value right, and do the effects "
-                "describe the strut?"
+                f"The correction of {key} is {times:.2g} times the standard deviation {known}: is "
+                "its value right, and do the effects describe the strut?"
             )
     return notes
 

@@ -7,6 +7,8 @@ Priors, bounds of laws and limits of noise stand where they are used.
 
 from dataclasses import dataclass
 
+from rig.diagnosis.outcome import IMPROBABLE
+
 
 @dataclass(frozen=True)
 class SelectionCriteria:
@@ -58,6 +60,9 @@ class SelectionCriteria:
         significant: Least distance of a linear correction from zero, in standard deviations.
         bounded: The same for the size of an effect, the linear part projected out.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
+        improbable: Standard deviations of the model file's values from which on laws are not
+            believed that need such a mass, stiffness or damping, where no correction alone does:
+            one in some ten thousand is as far off (Gauss), so that the laws are the likelier error.
         leftover: Least share of a law's force along the motion that no change of the linear part
             replaces; with less the law is a linear correction. A force is seldom known to
             less (class 0.5 of ISO 7500-1 is half a percent).
@@ -94,6 +99,7 @@ class SelectionCriteria:
     significant: float = 4.0
     bounded: float = 4.0
     cancelling: float = -0.9
+    improbable: float = IMPROBABLE
     leftover: float = 0.005
     passive: float = 0.02
     dissipating_to: float = 10.0

@@ -152,7 +152,8 @@ class Pool:
             return
         self.fits[candidate] = validated
         self.invalid.pop(candidate, None)
-        why = find_defect(self.problem, result, self.along, self.criteria)
+        linear = self.fits.get(nominal(self.problem), validated).fit.parts.linear
+        why = find_defect(self.problem, result, linear, self.along, self.criteria)
         if why is not None:
             self.invalid[candidate] = why
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.problem.grid import Track
+from rig.diagnosis.problem.linear_part import PARAMETERS
 from rig.diagnosis.problem.problem import Problem, slots_of, strut_constants, strut_effects
 from rig.diagnosis.problem.track import forces_along, law_force, linear_forces
 from rig.diagnosis.search.criteria import SelectionCriteria
@@ -24,6 +25,12 @@ _VELOCITIES = 8
 """Velocities beyond the recorded ones at which power is evaluated."""
 _TINY = 1e-100
 """Least divisor."""
+_REPLACED = {
+    "mass": (),
+    "stiffness": ("nonlinear_stiffness", "stop", "backlash"),
+    "damping": ("nonlinear_damping", "friction", "fade"),
+}
+"""Linear parameters whose priors rule laws out, and the families that may replace each."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
 """Families that are no property of the strut, or that store energy outside it: may be active."""
 
@@ -35,9 +42,16 @@ def smooth_tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
 
 
 def find_defect(
-    problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], criteria: SelectionCriteria
+    problem: Problem,
+    result: Fit,
+    lawless: Array,
+    motions: Sequence[tuple[int, Track]],
+    criteria: SelectionCriteria,
 ) -> str | None:
-    """The reason for which a model is not used; None where there is none."""
+    """The reason for which a model is not used; None where there is none.
+
+    `lawless` are the corrections of the best linear model, shape (L,).
+    """
     forces = forces_along(problem, result.model, motions)
     along = [track for _, track in motions]
     return (
@@ -45,6 +59,7 @@ def find_defect(
         or _find_linear_law(result, forces, along, criteria)
         or _find_cancelling_laws(result, forces, criteria)
         or _find_active_strut(problem, result, along, criteria)
+        or _find_improbable_linear_part(problem, result, lawless, criteria)
     )
 
 
@@ -129,6 +144,30 @@ def _find_cancelling_laws(
             size = float(np.linalg.norm(a) * np.linalg.norm(b))
             if size > 0.0 and float(a @ b) < criteria.cancelling * size:
                 return f"{name} and {other} cancel each other"
+    return None
+
+
+def _find_improbable_linear_part(
+    problem: Problem, result: Fit, lawless: Array, criteria: SelectionCriteria
+) -> str | None:
+    """Reason against laws that require a linear part far from the model file's.
+
+    Only where no correction without a law goes as far. Laws of a spring may replace the linear one,
+    and laws of a damper the linear damping.
+    """
+    families = {(strut, effect(name).family) for strut, name in result.candidate.new}
+    for p, change, alone in zip(problem.linear, result.parts.linear, lawless, strict=True):
+        if p.kind not in _REPLACED:
+            continue
+        is_replaced = change < 0.0 and any(
+            (p.strut, family) in families for family in _REPLACED[p.kind]
+        )
+        times = abs(float(change)) / p.deviation
+        if times > criteria.improbable and abs(change) > abs(alone) and not is_replaced:
+            return (
+                f"it requires {PARAMETERS[p.kind]} {p.nominal + float(change):.3g}, "
+                f"{times:.2g} standard deviations from the model file's {p.nominal:.3g}"
+            )
     return None
 
 

@@ -144,7 +144,8 @@ def _headline(diagnosis: Diagnosis) -> str:
             pass
     if names:
         also = " and more" if diagnosis.verdict == "partly_explained" else ""
-        return f"{capital(join_words(names, 'and'))}{also} missing"
+        far = "".join(f"; {_direction(it)}" for it in diagnosis.linear if it.is_improbable)
+        return f"{capital(join_words(names, 'and'))}{also} missing{far}"
     parts = [_direction(item) for item in diagnosis.linear if _differs(item)]
     parts += [f"{item.name} {item.change}" for item in diagnosis.existing]
     parts += [
