@@ -1,15 +1,16 @@
 """`rig check`."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.junit import JUnitFile, Outcome, write_junit
 from rig.cli.summary_file import SummaryFolder, write_summary
 from rig.cli.terminal import (
     FAILED,
-    ConfigFile,
     JsonFlag,
     print_json,
     print_table,
@@ -22,11 +23,28 @@ if TYPE_CHECKING:
 
     from rig.plan.preflight_checks import Finding
 
-EXAMPLES = "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml`"
+EXAMPLES = (
+    "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml` · what recordings can "
+    "determine: `rig check runs/7 more.csv --model model.yaml`"
+)
 
 
 def check_command(
-    config: ConfigFile,
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="CONFIG|RUN...",
+            help="Configuration, a YAML file; with --model: run folders or CSV files.",
+        ),
+    ],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="Check recordings instead: what they can determine of this model file, or shipped "
+            "model.",
+        ),
+    ] = None,
     out: SummaryFolder = None,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
@@ -34,7 +52,59 @@ def check_command(
     """Check a configuration before the bench moves: signals, units, rate, bus load, poles.
 
     The exit code is 1 if there is an error; warnings do not change it.
+
+    With --model, recordings are checked before they are diagnosed: stroke, speeds, frequencies,
+    noise; which linear parameters and which families of laws they can determine; what to record in
+    addition. The bounds are those of a right model: a diagnosis does no better.
     """
+    if model is not None:
+        _check_recordings(paths, model, out, as_json=as_json, junit=junit)
+        return
+    if len(paths) > 1:
+        raise InputError(
+            f"{paths[1]}: expected one configuration, or recordings with --model MODEL"
+        )
+    if paths[0].is_dir() or paths[0].suffix.lower() == ".csv":
+        raise InputError(f"{paths[0]}: is a recording, expected a configuration, or --model MODEL")
+    _check_configuration(paths[0], out, as_json=as_json, junit=junit)
+
+
+def _check_recordings(
+    paths: "Sequence[Path]", model: str, out: Path | None, *, as_json: bool, junit: Path | None
+) -> None:
+    from dart_model.spec import load_named_model
+    from rig.diagnosis.determinable import find_determinable
+    from rig.pages import determinable_tables as texts
+    from rig.recordings.read import read_recording
+
+    spec = load_named_model(model, Path())
+    names = [strut.name for strut in spec.struts]
+    found = find_determinable(spec, [read_recording(path, names) for path in paths])
+    warnings = texts.warnings(found)
+    summary: dict[str, object] = {"schema": 1, **asdict(found), "warnings": warnings}
+    if as_json:
+        print_json(summary)
+    else:
+        for title, rows in texts.recordings(found):
+            print_table(("", ""), rows, title)
+        heads = ("parameter", "strut", "nominal", "known to", "model file", "varies with")
+        print_table(heads, texts.linear(found), "Linear part, standard deviations")
+        heads = ("family", "strut", "found from", "of the force", "least unlike", "told from")
+        print_table(heads, texts.families(found), "Laws, RMS of their force")
+        for text in warnings:
+            print_text(f"- {text}", "yellow")
+        if not warnings:
+            print_text("These recordings determine the linear part and all families.", "green")
+        runs = " ".join(str(path) for path in paths)
+        print_text(f"Next: `rig diagnose {runs} --model {model} --out found`")
+    write_summary(out, summary)
+    outcomes = [Outcome("what recordings determine", text, failed=False) for text in warnings]
+    write_junit(junit, f"rig check {spec.name}", outcomes)
+
+
+def _check_configuration(
+    config: Path, out: Path | None, *, as_json: bool, junit: Path | None
+) -> None:
     from rig.plan.load import load_plan
     from rig.plan.preflight_checks import Severity, check
 

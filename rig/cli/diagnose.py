@@ -51,8 +51,9 @@ def diagnose(
     spec = load_named_model(model, Path())
     if not as_json:
         print_text(
-            "Searching for what the model lacks: usually 3 to 12 minutes for each minute of "
-            "recordings that it learns from. Ctrl-C ends the search; nothing is written then."
+            "Searching for what the model lacks: usually half a minute to 5 minutes for each "
+            "minute of recordings that it learns from. Ctrl-C ends the search; nothing is written "
+            "then."
         )
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)

@@ -126,6 +126,14 @@ def percent(share: float | None, decimals: int) -> str:
     return f"{number(100.0 * share, decimals)}{_NO_BREAK}%"
 
 
+def share(part: float) -> str:
+    """A share in per cent, with two digits that count."""
+    if not math.isfinite(part):
+        return "–"
+    decimals = 1 - math.floor(math.log10(100.0 * part)) if part else 0
+    return percent(part, min(max(decimals, 0), 6))
+
+
 def capital(text: str) -> str:
     """The text with a capital first letter."""
     return text[:1].upper() + text[1:]

@@ -12,6 +12,7 @@ from rig.pages.number_formats import (
     percent,
     quantity,
     ratio,
+    share,
     value_and_interval,
     with_unit,
 )
@@ -60,17 +61,10 @@ def errors(diagnosis: Diagnosis) -> tuple[Row, ...]:
         over = ratio(x.after, least)
         texts.append((name, *_each(x, unit), change(x), quantity(least, unit), over))
         if x.signal > 0.0:
-            shares = (_share(it / x.signal) for it in (x.before, x.linear, x.after))
+            shares = (share(it / x.signal) for it in (x.before, x.linear, x.after))
             signal = f"as a share of the signal, {quantity(x.signal, unit)} RMS"
-            texts.append((signal, *shares, "", _share(least / x.signal), ""))
+            texts.append((signal, *shares, "", share(least / x.signal), ""))
     return tuple(texts)
-
-
-def _share(share: float) -> str:
-    """A share in per cent, with two digits that count."""
-    if not math.isfinite(share):
-        return "–"
-    return percent(share, min(max(1 - math.floor(math.log10(100.0 * share)), 0), 4) if share else 0)
 
 
 class Bar(NamedTuple):
