@@ -4,21 +4,39 @@ Reference: van der Schaft, L2-Gain and Passivity Techniques in Nonlinear Control
 passivity; here power is evaluated where the motion was.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
+from dart_model.effects.periodic_force import PERIODIC_FORCE
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.linear_part import PARAMETERS
-from rig.diagnosis.problem.problem import Problem, slots_of, strut_constants, strut_effects
+from rig.diagnosis.problem.problem import (
+    Problem,
+    StrutEffect,
+    slots_of,
+    strut_constants,
+    strut_effects,
+)
 from rig.diagnosis.problem.track import forces_along, law_force, linear_forces
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, fit_covariance, start_variables
+from rig.diagnosis.search.fit import (
+    UNBOUND,
+    Fit,
+    effect_variables,
+    fit_covariance,
+    law_values,
+    start_variables,
+)
 
 Array = NDArray[np.float64]
 
+_ONE_LINE = 0.9
+"""Share of a drive's power in one line from which on it is a sine."""
+_WIDTH = 2
+"""Bins on either side that belong to a line under Hann's window."""
 _CELLS = 12
 """Cells of height and of velocity in which power is evaluated."""
 _VELOCITIES = 8
@@ -60,6 +78,7 @@ def find_defect(
         or _find_cancelling_laws(result, forces, criteria)
         or _find_active_strut(problem, result, along, criteria)
         or _find_improbable_linear_part(problem, result, lawless, criteria)
+        or _find_harmonic_of_drive(result, along, law_values(problem, result))
     )
 
 
@@ -169,6 +188,42 @@ def _find_improbable_linear_part(
                 f"{times:.2g} standard deviations from the model file's {p.nominal:.3g}"
             )
     return None
+
+
+def _find_harmonic_of_drive(
+    result: Fit, along: Sequence[Track], values: Mapping[StrutEffect, Array]
+) -> str | None:
+    """Reason against a periodic force whose frequency is a multiple of that of the drive.
+
+    Whatever is not linear answers a sine by its multiples.
+    """
+    for law in result.candidate.new:
+        if law[1] != PERIODIC_FORCE.name:
+            continue
+        frequency_hz = PERIODIC_FORCE.named(values[law].tolist())["frequency_hz"]
+        orders = [harmonic_of_drive(frequency_hz, law[0], track) for track in along]
+        if all(order is not None for order in orders):
+            return f"its frequency is {orders[0]} times that of the drive ({law[1]})"
+    return None
+
+
+def harmonic_of_drive(frequency_hz: float, strut: int, track: Track) -> int | None:
+    """How many times the drive's frequency a frequency is; None where it is no multiple of a line.
+
+    The drive is the applied force, or the height of a strut where there is none.
+    """
+    drive = track.applied_n if np.any(track.applied_n) else track.heights_m[strut]
+    length_s = float(track.t_s[-1] - track.t_s[0])
+    power = np.abs(np.fft.rfft((drive - drive.mean()) * np.hanning(len(drive)))) ** 2
+    line = int(np.argmax(power))
+    around = slice(max(line - _WIDTH, 0), line + _WIDTH + 1)
+    if line == 0 or float(power[around].sum()) < _ONE_LINE * float(power.sum()):
+        return None
+    bins = np.arange(len(power))[around]
+    line_hz = float(np.average(bins, weights=power[around])) / length_s
+    order = round(frequency_hz / line_hz)
+    off_hz = abs(frequency_hz - order * line_hz)
+    return order if order > 0 and off_hz < max(order, _WIDTH) * 0.5 / length_s else None
 
 
 def _find_active_strut(

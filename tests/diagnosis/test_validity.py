@@ -1,0 +1,61 @@
+"""Why fitted laws are not believed."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rig.diagnosis.problem.grid import Track
+from rig.diagnosis.problem.problem import Candidate, LinearParameter, Parts
+from rig.diagnosis.search import validity
+from rig.diagnosis.search.criteria import CRITERIA
+
+T_S = np.arange(20_000) / 500.0
+ZERO = np.zeros(len(T_S))
+
+
+def track(applied_n=ZERO, height_m=ZERO):
+    return Track(T_S, height_m[np.newaxis], ZERO[np.newaxis], applied_n, ZERO + 20.0)
+
+
+@pytest.mark.parametrize(("frequency_hz", "order"), [(2.359, 3), (3.934, 5), (1.1, None)])
+def test_a_multiple_of_a_sine_is_the_drives(frequency_hz, order):
+    sine = 40.0 * np.sin(2.0 * np.pi * 0.7867 * T_S + 0.4)
+    assert validity.harmonic_of_drive(frequency_hz, 0, track(applied_n=sine)) == order
+    assert validity.harmonic_of_drive(frequency_hz, 0, track(height_m=1e-3 * sine)) == order
+
+
+def test_a_drive_of_many_lines_has_no_multiples():
+    noise = np.random.default_rng(2).normal(size=len(T_S))
+    sweep = np.sin(2.0 * np.pi * (0.5 + 0.1 * T_S) * T_S)
+    for drive in (noise, sweep):
+        assert validity.harmonic_of_drive(2.0, 0, track(applied_n=drive)) is None
+
+
+MASS = LinearParameter(0, "mass", 10.0, 0.5, -9.0)
+STIFFNESS = LinearParameter(0, "stiffness", 2000.0, 400.0, -2000.0)
+DAMPING = LinearParameter(0, "damping", 100.0, 40.0, -100.0)
+
+
+def reason(changes, law, lawless=(0.0, 0.0, 0.0)):
+    problem = SimpleNamespace(linear=(MASS, STIFFNESS, DAMPING))
+    candidate = Candidate((), ((0, law),))
+    result = SimpleNamespace(candidate=candidate, parts=Parts(np.array(changes), np.zeros(1), ()))
+    return validity._find_improbable_linear_part(problem, result, np.array(lawless), CRITERIA)
+
+
+def test_laws_that_need_an_improbable_mass_are_not_believed():
+    assert reason((1.9, 0.0, 0.0), "coulomb_friction") is None
+    why = reason((2.1, 0.0, 0.0), "coulomb_friction")
+    assert why is not None
+    assert "mass_kg 12.1, 4.2 standard deviations from the model file's 10" in why
+
+
+def test_a_correction_that_no_law_makes_larger_says_nothing_against_the_law():
+    assert reason((2.1, 0.0, 0.0), "coulomb_friction", lawless=(2.2, 0.0, 0.0)) is None
+
+
+def test_a_law_with_memory_does_not_replace_the_spring_but_a_spring_does():
+    assert reason((0.0, -1900.0, 0.0), "maxwell") is not None
+    assert reason((0.0, -1900.0, 0.0), "gas_spring") is None
+    assert reason((0.0, 1900.0, 0.0), "gas_spring") is not None
