@@ -28,11 +28,13 @@ def test_a_law_with_too_many_parameters_gives_way_to_one_of_its_family(tmp_path)
     assert [effect.family for effect in found.effects] == ["nonlinear_stiffness"]
 
 
-def test_a_law_that_held_out_data_do_not_call_for_is_named_where_others_do(tmp_path):
+def test_a_law_that_held_out_data_do_not_call_for_is_a_candidate_where_others_do(tmp_path):
     # A stop that the held-out run hardly reaches: the linear model alone is at the floor there.
     found = diagnosed(2026112301261, "stop", tmp_path)
-    assert found.verdict == "explained"
     assert [effect.family for effect in found.effects] == ["stop"]
+    assert found.effects[0].is_candidate
+    assert found.verdict == "ambiguous"
+    assert found.ambiguous_with == ()
 
 
 class Weakening(dyno.Nothing):
