@@ -23,6 +23,7 @@ from dart_model.virtual_sensors import KINDS
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.bridge.values import Mode
 from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
+from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.files.pictures import Figure
 from rig.formats.mapping import TableMapping
 from rig.guide.site import Block
@@ -86,6 +87,7 @@ def generated_blocks(
         "published-quantities": _published_quantities,
         "virtual-sensors": _virtual_sensors,
         "effect-families": _families,
+        "criteria": _criteria,
         "modes": lambda: _table(
             ("Mode", "Number on the bus"), [(mode.name, str(mode.value)) for mode in Mode]
         ),
@@ -115,6 +117,17 @@ def _keys(model: type[object]) -> str:
 def _observer_keys() -> str:
     parts = [f"### Kind `{kind}`\n\n{_keys(observer)}" for kind, observer in OBSERVERS.items()]
     return "\n\n".join(parts)
+
+
+def _criteria() -> str:
+    """Thresholds of a diagnosis, with their values, as their docstring explains them."""
+    text = inspect.getdoc(SelectionCriteria) or ""
+    entries = re.split(r"^    (\w+): ", text.partition("Attributes:\n")[2], flags=re.MULTILINE)[1:]
+    rows = [
+        (f"`{name}`", f"{getattr(CRITERIA, name):g}", " ".join(meaning.split()))
+        for name, meaning in zip(entries[::2], entries[1::2], strict=True)
+    ]
+    return _table(("Threshold", "Value", "Meaning"), rows)
 
 
 def _bench_effects() -> str:

@@ -80,6 +80,7 @@ _NAVIGATION: dict[str, tuple[str, ...]] = {
         "explanation/sample-times",
         "explanation/timing",
         "explanation/diagnosis",
+        "explanation/attribution",
         "explanation/verdicts",
         "explanation/damper-figures",
         "explanation/architecture",
