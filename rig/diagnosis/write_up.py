@@ -89,6 +89,8 @@ _LEAST_REST = 0.05
 _MOSTLY = 2.0
 """Ratio of the remaining forces at standstill and in motion from which on the former decides."""
 
+_RISEN = 1.1
+"""Ratio of two residual forces from which on one has risen: their floors scatter by a tenth."""
 _AT_BOUND = 1e-3
 """Distance from the end of a range, relative, within which a parameter counts as at it."""
 
@@ -173,7 +175,8 @@ def compose_result(
         + _notes_of_channels(channels)
         + _notes_of_bounds(problem, estimates)
         + _notes_of_friction_like_laws(problem, chosen, after)
-        + _notes_of_standstill(problem, after),
+        + _notes_of_standstill(problem, after)
+        + notes_of_opposite_errors(_held_out(evaluations, by_blocks=by_blocks)),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
         damper_forces(problem, chosen, estimates.covariance, after),
@@ -447,6 +450,18 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
         quadratic_means(cells) if cells else None,
         tuple(figures),
         "blocks" if by_blocks else "runs",
+    )
+
+
+def notes_of_opposite_errors(held_out: HeldOut) -> tuple[str, ...]:
+    """Whether the force that is missing grows while the height error falls, and what that means."""
+    heights, force = held_out.height_rmse_m, held_out.residual_force_rmse_n
+    if not (heights.after < heights.before and force.after > _RISEN * force.before):
+        return ()
+    return (
+        f"The height error falls, but the residual force along the motion rises from "
+        f"{force.before:.3g} to {force.after:.3g} N RMS: the laws fit the motion, not the force. "
+        "Compare the force with a load cell before it is used.",
     )
 
 

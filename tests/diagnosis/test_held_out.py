@@ -6,10 +6,11 @@ import pytest
 
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.evaluate import HeldOutLaw
-from rig.diagnosis.outcome import ModelErrors, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import HeldOut, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem.problem import RunEvaluation
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.verdict import confirmation, find_reason_against_laws
+from rig.diagnosis.write_up import notes_of_opposite_errors
 from tests.diagnosis import little_bench as bench
 
 FLOOR_M = 1e-5
@@ -119,3 +120,10 @@ def test_a_stop_that_no_held_out_run_reaches_is_a_candidate(learnt):
     assert found.verdict == "ambiguous"
     assert found.ambiguous_with == ()
     assert found.suggested_excitation
+
+
+@pytest.mark.parametrize(("after_n", "notes"), [(0.5, 0), (1.05, 0), (1.5, 1)])
+def test_a_force_that_rises_while_heights_come_nearer_is_noted(after_n, notes):
+    heights = ModelErrors(1e-3, 1e-3, 1e-4, 1e-2)
+    held_out = HeldOut(heights, ModelErrors(1.0, 1.0, after_n, 10.0), None, (), "runs")
+    assert len(notes_of_opposite_errors(held_out)) == notes
