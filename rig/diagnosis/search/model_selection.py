@@ -85,20 +85,25 @@ def select_model(
 ) -> SearchResult:
     """The result of a search; `first` are the models about the linear one, for rejected laws."""
     progress("removing superfluous laws", 0.85)
-    most_laws = pool.criteria.most_laws
+    most_laws, is_repeated, rejected = pool.criteria.most_laws, False, ()
+    single = [it.laws[-1] for it in first_round.screenings] if first_round else []
     while True:
-        chosen = _without_superfluous_laws(pool, pool.chosen(most_laws), progress)
+        best = pool.chosen(most_laws)
+        chosen = _without_superfluous_laws(pool, best, progress)
         final, alike = _with_few_corrections(pool, chosen)
         why = find_unidentifiable_law(pool.problem, final.fit) if final.size else None
-        if why is None:
+        if why is not None:
+            pool.reject(chosen.fit.candidate, why)
+            # Data that do not determine so many laws determine no larger number of others.
+            most_laws = chosen.size
+            _attempt_plainer(pool, chosen)
+            continue
+        evidence = weigh_laws(pool, first, single, chosen)
+        # A rival that was fitted until converged may be the better model.
+        if is_repeated or pool.chosen(most_laws).fit.candidate == best.fit.candidate:
             break
-        pool.reject(chosen.fit.candidate, why)
-        # Data that do not determine so many laws determine no larger number of others.
-        most_laws = chosen.size
-        _attempt_plainer(pool, chosen)
+        is_repeated = True
     progress("comparing rivals", 0.9)
-    single = [it.laws[-1] for it in first_round.screenings] if first_round else []
-    evidence, rejected = weigh_laws(pool, first, single, chosen), ()
     rivals = _rivals(pool, chosen) or _rivals_of_one_frequency(pool, final)
     superfluous = _superfluous_effects(pool, chosen)
     lawless = _with_few_corrections(pool, pool.linear)[0] if final.size else final
