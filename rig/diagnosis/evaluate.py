@@ -106,7 +106,11 @@ def weigh_on_held_out(problems: Problems, corrected: Fit) -> dict[StrutEffect, H
     if not model.candidate.new:
         return {}
     if problems.by_blocks:
-        problem = problem.of_held_out_blocks()
+        starts = zip(model.parts.starts, problem.grids, strict=True)
+        parts = model.parts._replace(
+            starts=tuple(start for start, grid in starts if np.any(grid.held_out))
+        )
+        model, problem = model._replace(parts=parts), problem.of_held_out_blocks()
     else:
         model = _fit_starts(problems, model)
     free = free_linear(problem, model.candidate)

@@ -127,3 +127,12 @@ def test_a_force_that_rises_while_heights_come_nearer_is_noted(after_n, notes):
     heights = ModelErrors(1e-3, 1e-3, 1e-4, 1e-2)
     held_out = HeldOut(heights, ModelErrors(1.0, 1.0, after_n, 10.0), None, (), "runs")
     assert len(notes_of_opposite_errors(held_out)) == notes
+
+
+@pytest.mark.slow
+def test_a_recording_without_a_held_out_block_is_left_out():
+    runs = [bench.run(Stop(), seed=2, duration_s=1.5), bench.run(Stop(), seed=1, duration_s=20.0)]
+    found = diagnose(bench.model(), runs).diagnosis
+    assert found.held_out.source == "blocks"
+    assert [run.run for run in found.held_out.runs] == [runs[1].name]
+    assert [effect.evidence.held_out for effect in found.effects] == ["confirmed"]

@@ -175,8 +175,10 @@ class FreeRunProblem(Problem):
         return self.runs[k].grid.fitted
 
     def of_held_out_blocks(self) -> "FreeRunProblem":
-        runs = tuple(run._replace(grid=run.grid.of_held_out) for run in self.runs)
-        return replace(self, runs=runs)
+        held_out = (run for run in self.runs if np.any(run.grid.held_out))
+        return replace(
+            self, runs=tuple(run._replace(grid=run.grid.of_held_out) for run in held_out)
+        )
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRunProblem":
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))

@@ -194,8 +194,10 @@ class PrescribedProblem(Problem):
         return self.runs[k].fit_nodes
 
     def of_held_out_blocks(self) -> "PrescribedProblem":
-        runs = tuple(run._replace(grid=run.grid.of_held_out) for run in self.runs)
-        return replace(self, runs=runs)
+        held_out = (run for run in self.runs if np.any(run.grid.held_out))
+        return replace(
+            self, runs=tuple(run._replace(grid=run.grid.of_held_out) for run in held_out)
+        )
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))

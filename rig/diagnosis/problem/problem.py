@@ -320,7 +320,7 @@ class Problem(ABC):
 
     @abstractmethod
     def of_held_out_blocks(self) -> Self:
-        """The problem of the blocks that are held out, in place of all others."""
+        """The problem of the blocks that are held out, of the recordings that have any."""
 
     @abstractmethod
     def segments(
