@@ -2,8 +2,8 @@
 
 Of each recording: samples, resolution, clipping, stroke, speeds, directions, frequencies. Of each
 linear parameter: how well the motion determines it, by the Cramér-Rao bound. Of each family of
-laws: the force from which on it would be found, and from which on it is told from its nearest
-rival, by the response to its laws along the measured motion, linear part projected out.
+laws: the force from which on it would be found, and distinguished from its nearest rival, by the
+response to its laws along the measured motion, linear part projected out.
 
 References:
     Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993), 3.
@@ -38,7 +38,9 @@ Array = NDArray[np.float64]
 _SIDES = 0.05
 """Share of the power, or of the time, on either side of a band."""
 _ALIKE = 0.98
-"""Correlation of two estimates from which on they are hardly told apart."""
+"""Correlation of two estimates from which on they are hardly distinguished."""
+_TENTH = 0.1
+"""Share of the strut's force at which a family has to be named: what an engineer would miss."""
 _CLIPPED = 5
 """Samples in a row at an extreme that was reached at speed, from which on they are clipped."""
 _AT_SPEED = 0.3
@@ -104,7 +106,7 @@ class LinearBound:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the recordings tell more of it than the model file."""
+        """Whether the recordings determine it better than the model file."""
         return self.std < self.prior_std
 
 
@@ -117,8 +119,8 @@ class FamilyBound:
         strut: Name of the strut.
         least_n: RMS of its force from which on it would be found.
         least_share: The same as a share of the strut's force by the nominal model.
-        rival: Family from which it is told least; None where there is no other.
-        apart_n: RMS of its force from which on it is told from that; infinite where never.
+        rival: Family from which it is distinguished last; None where there is no other.
+        apart_n: RMS of its force from which on it is distinguished from that; infinite where never.
         excitation: What a recording that shows it needs.
     """
 
@@ -134,9 +136,6 @@ class FamilyBound:
     def is_determined(self) -> bool:
         """Whether it would be found, and named, at a tenth of the strut's force."""
         return self.apart_n * self.least_share <= _TENTH * self.least_n
-
-
-_TENTH = 0.1
 
 
 @dataclass(frozen=True)

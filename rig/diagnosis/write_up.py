@@ -147,6 +147,7 @@ def compose_result(
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
     estimates = FitEstimates(chosen, fit_covariance(chosen))
     corrected = spec_with_corrections(problem, chosen.model)
+    held_out = _held_out(evaluations, by_blocks=by_blocks)
     others = _other_families(search) if verdict in ("ambiguous", "partly_explained") else ()
     is_explained = verdict in ("explained", "ambiguous")
     channels = channel_corrections(problem, estimates, is_explained=is_explained)
@@ -160,7 +161,7 @@ def compose_result(
         search.rejected + _effects_hidden_from_bench(problem),
         others,
         _suggestion(search) if others or verdict == "ambiguous" else None,
-        _held_out(evaluations, by_blocks=by_blocks),
+        held_out,
         NoiseFloor(
             quadratic_mean([floor.height_rmse_m for floor in floors]),
             quadratic_mean([floor.residual_force_rmse_n for floor in floors]),
@@ -176,7 +177,7 @@ def compose_result(
         + _notes_of_bounds(problem, estimates)
         + _notes_of_friction_like_laws(problem, chosen, after)
         + _notes_of_standstill(problem, after)
-        + notes_of_opposite_errors(_held_out(evaluations, by_blocks=by_blocks)),
+        + notes_of_opposite_errors(held_out),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
         damper_forces(problem, chosen, estimates.covariance, after),

@@ -49,7 +49,7 @@ def linear(found: Determinable) -> tuple[Row, ...]:
 
 
 def families(found: Determinable) -> tuple[Row, ...]:
-    """Family, strut, least force, its share, the family it is told from least, and from when."""
+    """Family, strut, least force, its share, the family that is most alike, and apart from when."""
     return tuple(
         (
             capital(FAMILY_WORDS[it.family]),
@@ -81,9 +81,9 @@ def _of_recording(it: RecordingFacts) -> list[str]:
     if it.missing > _MISSING:
         texts.append(f"{percent(it.missing, 1)} of the heights are missing.")
     if it.clipped > 0.0:
-        share = percent(it.clipped, 2)
+        cut = percent(it.clipped, 2)
         texts.append(
-            f"{share} of the heights are cut off at an end of the sensor's range: mount it so that "
+            f"{cut} of the heights are cut off at an end of the sensor's range: mount it so that "
             "the whole stroke is within its range."
         )
     if it.resolution_m is not None and it.resolution_m > _COARSE * it.noise_m:
