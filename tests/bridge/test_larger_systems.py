@@ -93,6 +93,7 @@ def quarter_car(duration_s=4.0):
     return model, heights_m, applied_n, -stiffness * (heights_m - rest) - damping * rates
 
 
+@pytest.mark.slow
 def test_errors_of_two_struts_are_corrected_at_once():
     """With the shipped observers: the noise-aware ones, one a strut, are unstable in this car."""
     observers = load_plan(CONFIGS / "quarter_car.yaml").observers
@@ -109,6 +110,7 @@ def test_errors_of_two_struts_are_corrected_at_once():
     assert max(both) < 0.45
 
 
+@pytest.mark.slow
 def test_a_tyre_that_nobody_measures_is_what_its_law_says():
     model, heights_m, applied_n, forces_n = quarter_car(duration_s=6.0)
     truth = forces_n[:, 1]

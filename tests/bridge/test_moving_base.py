@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dart_model.spec import MODELS, dump_model, parse_model
 from rig.formats.run_arrays import open_run
@@ -69,6 +70,7 @@ def driven_by_force(folder: Path):
     )
 
 
+@pytest.mark.slow
 def test_a_moving_base_costs_less_than_a_third_of_the_force_error(tmp_path):
     moved, shares = force_errors(*on_a_road(), tmp_path / "moved")
     still, _ = force_errors(*driven_by_force(tmp_path), tmp_path / "still")

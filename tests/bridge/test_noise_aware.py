@@ -165,6 +165,7 @@ def test_noise_and_lag_of_the_linear_loop_are_those_of_the_simulated_one(observe
     assert linear.lag_gain(np.array([frequency_hz]))[0] == pytest.approx(amplitude, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["kalman", "pi", "joint"])
 def test_a_model_moves_by_noise_as_stated(kinds):
     """Covariance of heights and rates against the loop's own steps under noise."""

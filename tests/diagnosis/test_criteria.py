@@ -83,6 +83,7 @@ def explored(criteria):
     return pool
 
 
+@pytest.mark.slow
 def test_without_a_beam_no_pair_is_looked_for():
     assert max(model.size for model in explored(CRITERIA).fits.values()) == 2
     assert max(model.size for model in explored(replace(CRITERIA, beam=0)).fits.values()) == 1

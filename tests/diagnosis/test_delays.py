@@ -182,6 +182,7 @@ def test_at_one_frequency_a_delay_that_no_bench_has_is_no_rival():
     assert (found.verdict, found.ambiguous_with) == ("explained", ())
 
 
+@pytest.mark.slow
 def test_simultaneous_channels_have_no_correction():
     for found in (
         diagnose(dyno.model(), [dyno.run(dyno.Nothing())]).diagnosis,

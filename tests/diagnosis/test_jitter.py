@@ -38,7 +38,11 @@ def assert_alike(one, other):
 
 
 @pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 20))]
+    "seed",
+    [
+        pytest.param(0, marks=pytest.mark.slow),
+        *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 20)),
+    ],
 )
 def test_frames_that_wait_up_to_half_a_cycle_change_no_name_and_no_value(seed, tmp_path):
     at_once, late = (diagnose_run(seed, jitter_ns, tmp_path) for jitter_ns in (0, HALF_A_CYCLE_NS))

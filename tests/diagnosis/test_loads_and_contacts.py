@@ -39,6 +39,7 @@ class LiftingStrut(dyno.Nothing):
         return max(dyno.STIFFNESS * (z - dyno.FREE) + dyno.DAMPING * v, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "name", "truth"),
     [
@@ -56,6 +57,7 @@ def test_friction_under_a_load_is_found_with_its_share(effect, name, truth):
         assert holds(estimate, value)
 
 
+@pytest.mark.slow
 def test_a_contact_that_is_lost_and_met_again_is_found():
     """A longer flight, of which nothing is known but its ends, is another matter."""
     runs = [

@@ -57,6 +57,7 @@ def rough(mass=1.0, stiffness=1.0, damping=1.0):
     return spec.model_copy(update={"skeleton": skeleton, "struts": (tyre, suspension)})
 
 
+@pytest.mark.slow
 def test_a_right_model_lacks_nothing_and_leaves_the_noise():
     found = diagnose(rough(), [recording(1)], [recording(2)]).diagnosis
     assert found.verdict == "nothing_missing"
@@ -66,6 +67,7 @@ def test_a_right_model_lacks_nothing_and_leaves_the_noise():
     assert any("The mass of body is taken as the model has it" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_measured_acceleration_is_used():
     runs = [recording(seed, acceleration=True) for seed in (1, 2)]
     found = diagnose(rough(), runs[:1], runs[1:]).diagnosis

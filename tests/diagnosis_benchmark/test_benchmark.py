@@ -293,6 +293,7 @@ def test_filled_slots_hold_what_they_are_for():
     assert fill(Slot("complete", "complete", 0, 0)).families == ()
 
 
+@pytest.mark.slow
 def test_results_are_kept_and_tabulated(tmp_path, monkeypatch):
     calls = []
 

@@ -88,6 +88,7 @@ def test_a_record_in_other_units_is_refused():
         characterise_record(ForceRecord("mm", t_s, 1e3 * height_m, force_n))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [-0.002, 0.002, 0.01])
 def test_a_lag_of_the_cell_is_found_and_removed(lag_s):
     """Without it the spring rate rises with speed, and forces at peak speed are too small."""
@@ -118,6 +119,7 @@ def test_a_record_without_lag_and_drift_is_left_as_it_is():
     assert not found.quality
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift_n", [-60.0, 100.0])
 @pytest.mark.parametrize("lag_s", [0.0, 0.005])
 def test_a_drift_of_the_zero_is_removed(drift_n, lag_s):

@@ -152,6 +152,7 @@ def test_the_bus_has_what_the_log_has(ended):
         assert np.max(np.abs(decoded[name] - logged)) <= 0.51 * step
 
 
+@pytest.mark.slow
 def test_a_replay_is_the_same_and_adds_what_the_run_did_not_have(
     ended, tmp_path, monkeypatch, capsys
 ):

@@ -82,6 +82,7 @@ def test_generator_shares_no_code_with_what_it_judges():
                 assert name.split(".")[0] not in {"rig", "dart_model", "can_dbc"}, path.name
 
 
+@pytest.mark.slow
 def test_linear_bench_matches_closed_form():
     t_s, motion = driven((), lambda t: 0.0 * t, Rig(height_m=BENCH.free_length_m))
     omega = np.sqrt(BENCH.stiffness_n_per_m / BENCH.mass_kg)

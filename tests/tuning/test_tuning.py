@@ -86,6 +86,7 @@ def tuned(folder, kind="kalman", source=None):
     return ready, found
 
 
+@pytest.mark.slow
 def test_noise_latency_and_gains_come_from_a_run(late):
     ready, found = tuned(late)
     # The sensor's noise and the rounding of its steps.
@@ -244,6 +245,7 @@ def rig(monkeypatch, *arguments):
     return int(ended.value.code or 0)
 
 
+@pytest.mark.slow
 def test_the_command(late, monkeypatch, capsys, tmp_path):
     asked = ("tune", late / "rig.yaml", "--residual-n", 60, "--up-to-hz", 5)
     assert rig(monkeypatch, *asked, "--plot", tmp_path / "plot.png") == 0
@@ -260,6 +262,7 @@ def test_the_command(late, monkeypatch, capsys, tmp_path):
     assert parts["all"] == pytest.approx(np.hypot(parts["noise"], parts["lag"]))
 
 
+@pytest.mark.slow
 def test_a_second_tuning_hardly_helps_and_another_model_is_written(late, monkeypatch, capsys):
     text = (late / "rig.yaml").read_text()
     (late / "noted.yaml").write_text(f"# of this bench\n{text}")
