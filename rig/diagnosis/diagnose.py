@@ -191,13 +191,15 @@ def _search(
     fits = first_fits(problem)
     problem = _with_residual_noise(problem, fits[1])
     part = part_of(problem, _SEARCHED_NODES)
+    quick = problem.coarser(fits[1].model)
     if part is problem:
-        first, last, single = _explore_twice(part, fits, criteria, within(progress, 0.05, 0.85))
+        first, last, single = _explore_twice(quick, fits, criteria, within(progress, 0.05, 0.85))
     else:
+        of_part = first_fits(part)
         first, last, single = _explore_twice(
-            part, first_fits(part), criteria, within(progress, 0.05, 0.6)
+            part.coarser(of_part[1].model), of_part, criteria, within(progress, 0.05, 0.6)
         )
-        last = _fit_to_all(problem, fits, last, within(progress, 0.6, 0.85))
+        last = _fit_to_all(quick, fits, last, within(progress, 0.6, 0.85))
     result = select_model(last, first, single, progress)
     chosen = _refit_with_finer_steps(last.problem, result.chosen)
     return result._replace(chosen=chosen), last.problem

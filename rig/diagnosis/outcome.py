@@ -127,6 +127,28 @@ class Evidence:
     held_out_log_likelihood: float
 
 
+Interval = tuple[float, float]
+"""Its lower and its upper end."""
+
+
+@dataclass(frozen=True)
+class ActingRange:
+    """Where the recordings show an effect; beyond what was recorded they say nothing of it.
+
+    Attributes:
+        height_m: Parts of the recorded heights in which its force stands out from what the
+            corrected model leaves.
+        velocity_m_per_s: Likewise of the velocities; positive is rebound.
+        recorded_height_m: Heights that were recorded.
+        recorded_velocity_m_per_s: Likewise.
+    """
+
+    height_m: tuple[Interval, ...]
+    velocity_m_per_s: tuple[Interval, ...]
+    recorded_height_m: Interval
+    recorded_velocity_m_per_s: Interval
+
+
 @dataclass(frozen=True)
 class FoundEffect:
     """An effect that the nominal model lacks.
@@ -140,6 +162,7 @@ class FoundEffect:
         force_rms_n: Root mean square of its force along the recordings.
         parameters: Estimates by name.
         evidence: What speaks for it; None of a linear correction and a table.
+        where: Where it acts; None of a linear correction.
     """
 
     family: str
@@ -149,6 +172,7 @@ class FoundEffect:
     force_rms_n: float
     parameters: dict[str, Estimate]
     evidence: Evidence | None = None
+    where: ActingRange | None = None
 
     @property
     def is_candidate(self) -> bool:

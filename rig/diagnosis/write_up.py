@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
+from rig.diagnosis.acting_range import find_acting_range
 from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
 from rig.diagnosis.outcome import (
@@ -295,7 +296,10 @@ def _effects(
         residual = np.concatenate([f.force_n[strut] for _, f in residuals])
         parameters = estimates_of(problem, estimates, row, name)
         found = _describe_effect(problem, (strut, name), residual, forces[row][1], parameters)
-        effects.append(replace(found, evidence=evidence.get((strut, name))))
+        heights_m = np.concatenate([f.track.heights_m[strut] for _, f in residuals])
+        velocities = np.concatenate([f.track.velocities_m_per_s[strut] for _, f in residuals])
+        where = find_acting_range(heights_m, velocities, forces[row][1], residual)
+        effects.append(replace(found, evidence=evidence.get((strut, name)), where=where))
     return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
 
 

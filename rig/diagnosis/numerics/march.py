@@ -81,7 +81,9 @@ class Scenario(NamedTuple):
     Attributes:
         start: Coordinates, their rates and internal states, shape (2 n + states,).
         t_s: Times of the nodes, shape (N,).
-        applied_n: Applied force of laws at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
+        strides: Nodes where a stride begins or ends, the first and the last among them, shape
+            (S + 1,); each stride is taken in the same number of sub-steps.
+        applied_n: Applied force of laws at half sub-steps, shape (2 * substeps * S + 1,).
         temperature_c: Temperature at the nodes, shape (N,).
         inputs: Input vector at half sub-steps, shape (as above, inputs).
         moved: What moved bodies add to heights and to their rates at half sub-steps, shape (as
@@ -90,6 +92,7 @@ class Scenario(NamedTuple):
 
     start: Array
     t_s: Array
+    strides: Integers
     applied_n: Array
     temperature_c: Array
     inputs: Array
@@ -97,10 +100,17 @@ class Scenario(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """How finely a simulation steps; `bend`: share by which a smooth acceleration bends in one."""
+    """How finely a simulation steps.
+
+    Attributes:
+        bend: Share by which the force of a smooth law departs, within a step, from the parabola
+            that it followed before.
+        error_m: Change of height by a jump of force from which on a step is cut there.
+    """
 
     substeps: int
     bend: float
+    error_m: float
     stroke_m: float
 
 
@@ -161,15 +171,26 @@ class _Work(NamedTuple):
     heights_m: Array
     velocities: Array
     forces_n: Array
+    effects_n: Array
 
 
 class _Step(NamedTuple):
-    """Sums of a Runge-Kutta step at `x`; `twist`: second difference of the accelerations (n,)."""
+    """Sums of a Runge-Kutta step at `x`.
+
+    Attributes:
+        twist: Second difference of each effect's force, shape (effects,).
+        largest: Largest size of that force.
+        known: Second difference that the last step had, over the square of its length.
+        answer: Acceleration of its strut by a newton.
+    """
 
     x: Array
     began: Array
     total: Array
     twist: Array
+    largest: Array
+    known: Array
+    answer: Array
 
 
 class _Calls(NamedTuple):
@@ -201,25 +222,23 @@ class _Instant(NamedTuple):
     temperature_c: float
 
 
-_PIECES = 8
-"""Parts into which a step is cut where a force jumps."""
-_MOST_PIECES = 32
-"""The same where it jumps within one of these, as friction does that is all but a sign."""
-_LARGEST_ERROR = 5e-8
-"""Change of height within a step by a jump of force, as a share of the stroke, from which on the
-step is cut: a tenth of the resolution of usual height sensors over their range."""
+_CUTS = 4
+"""Parts into which a step, or a part of it, is cut where a force jumps."""
+_PARTS = _CUTS**3
+"""Most parts of a step: friction that is all but a sign takes such short ones."""
 
 FREE_LENGTH, STIFFNESS, DAMPING, GRAVITY, PRELOAD = range(5)
 """Columns of a strut's constants."""
 
 
 @inline
-def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bool) -> _Span:
+def _span(scenario: Scenario, substeps: int, stride: int, step: int, tabulated: bool) -> _Span:
     t, fine, temperature = scenario.t_s, scenario.applied_n, scenario.temperature_c
-    after = min(node + 1, t.shape[0] - 1)
+    node: int = scenario.strides[stride]
+    after: int = scenario.strides[min(stride + 1, scenario.strides.shape[0] - 1)]
     gap = t[after] - t[node]
     last = fine.shape[0] - 1
-    at = min(2 * (substeps * node + step), last)
+    at = min(2 * (substeps * stride + step), last)
     return _Span(
         node if tabulated else 0,
         after if tabulated else 0,
@@ -346,10 +365,11 @@ def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work)
                 at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
                 calls.states[slot], calls.parameters[slot], calls.struts[slot], calls.slopes[slot],
             )  # fmt: skip
-        work.forces_n[i] += calls.forces[slot](
+        work.effects_n[slot] = calls.forces[slot](
             at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
             calls.states[slot], calls.parameters[slot], calls.struts[slot],
         )  # fmt: skip
+        work.forces_n[i] += work.effects_n[slot]
 
 
 @inline
@@ -412,35 +432,42 @@ def _begin_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
 @inline
 def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
     """Add a stage's slope with its weight: 1, 2, 2, 1; the last one ends the step."""
-    n, size = step.twist.shape[0], step.x.shape[0]
+    size, effects = step.x.shape[0], step.twist.shape[0]
     if stage == 0:
-        for j in range(n):
-            step.twist[j] = work.slope[n + j]
+        for j in range(effects):
+            step.twist[j] = work.effects_n[j]
+            step.largest[j] = abs(work.effects_n[j])
         for i in range(size):
             step.total[i] = work.slope[i]
     elif stage == 3:
-        for j in range(n):
-            step.twist[j] += work.slope[n + j]
+        for j in range(effects):
+            step.twist[j] += work.effects_n[j]
+            step.largest[j] = max(step.largest[j], abs(work.effects_n[j]))
         for i in range(size):
             step.x[i] += h / 6.0 * (step.total[i] + work.slope[i])
     else:
-        for j in range(n):
-            step.twist[j] -= work.slope[n + j]
+        for j in range(effects):
+            step.twist[j] -= work.effects_n[j]
         for i in range(size):
             step.total[i] += 2.0 * work.slope[i]
 
 
 @inline
-def _has_jump(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
+def _has_jump(h: float, steps: Steps, step: _Step) -> bool:
     """Whether a force jumped within a step, as it does where a contact closes or friction turns."""
-    n = step.twist.shape[0]
-    worst = 0.0
-    largest = 0.0
-    for j in range(n):
-        worst = max(worst, abs(step.twist[j]))
-        largest = max(largest, abs(work.slope[n + j]), abs(step.total[n + j]) / 5.0)
-    least = _LARGEST_ERROR * steps.stroke_m
-    return bool(worst * h * h > 6.0 * least and worst > steps.bend * largest)
+    for j in range(step.twist.shape[0]):
+        jump = abs(step.twist[j] - step.known[j] * h * h)
+        moved_m = jump * step.answer[j] * h * h / 6.0
+        if moved_m > steps.error_m and jump > steps.bend * step.largest[j]:
+            return True
+    return False
+
+
+@inline
+def _learn_bends(h: float, step: _Step) -> None:
+    """Keep how the forces bent within a step without a jump, for the next one."""
+    for j in range(step.twist.shape[0]):
+        step.known[j] = step.twist[j] / (h * h)
 
 
 @inline
@@ -456,6 +483,24 @@ def _record(equations: Equations, node: int, work: _Work, out: Trajectory) -> No
         for j in range(n):
             along_strut += rows[a, i, j] * work.slope[n + j]
         out.accelerations_m_per_s2[node, i] = along_strut
+
+
+@inline
+def _fill(t_s: Array, before: int, after: int, out: Trajectory) -> None:
+    """Write the motion at the nodes within a stride, by Hermite's cubics."""
+    gap = t_s[after] - t_s[before]
+    for i in range(out.heights_m.shape[1]):
+        z, w = out.heights_m[:, i], out.velocities_m_per_s[:, i]
+        a = out.accelerations_m_per_s2[:, i]
+        for node in range(before + 1, after):
+            share = (t_s[node] - t_s[before]) / gap
+            z[node] = z[before] + _cubic(
+                z[after] - z[before], gap * w[before], gap * w[after], share
+            )
+            w[node] = w[before] + _cubic(
+                w[after] - w[before], gap * a[before], gap * a[after], share
+            )
+            a[node] = a[before] + share * (a[after] - a[before])
 
 
 class Directions(NamedTuple):
@@ -530,9 +575,10 @@ class _TangentWork(NamedTuple):
         velocities: Of their rates, likewise.
         forces: Of the struts' forces, likewise.
         laws: Derivatives of a law's force, then of its rates, one row after another.
-        at: Of the state at the step's beginning, or at that of the next piece, as `x`.
-        began: Of the state at the step's beginning, likewise.
+        at: Of the state at the beginning of the step, or of a part of it, as `x`.
         total: Of the sum of slopes, likewise.
+        rates: Of the velocities at the last stride's beginning and its end, shape (2, struts,
+            columns).
     """
 
     x: Array
@@ -543,8 +589,8 @@ class _TangentWork(NamedTuple):
     forces: Array
     laws: Array
     at: Array
-    began: Array
     total: Array
+    rates: Array
 
 
 class _SlopeCalls(NamedTuple):
@@ -701,16 +747,17 @@ def _accelerate_tangents(
 @inline
 def _step_tangents(
     model: Model, sizes: Integers, calls: _Calls, slopes: _SlopeCalls, scenario: Scenario,
-    directions: Directions, by: ByLinearPart, span: _Span, part: tuple[int, int], stages: _Stages,
+    directions: Directions, by: ByLinearPart, span: _Span, part: tuple[float, float],
+    stages: _Stages,
     work: _Work, tangent: _TangentWork,
 ) -> None:  # fmt: skip
-    """Move the derivatives of the state over a piece of a step, of so many."""
+    """Move the derivatives of the state over a part of a step: where it begins, and its length."""
     tabulated = model.equations.jacobian.shape[0] > 1
-    piece, pieces = part
-    h = span.step_s / pieces
+    first, length = part
+    h = span.step_s * length
     size, columns = tangent.x.shape
     for stage in range(4):
-        at = _instant(span, (piece + 0.5 * ((stage + 1) // 2)) / pieces)
+        at = _instant(span, first + 0.5 * ((stage + 1) // 2) * length)
         for i in range(size):
             work.x[i] = stages.x[stage, i]
             work.slope[i] = stages.slope[stage, i]
@@ -741,7 +788,10 @@ def _step_tangents(
 
 
 @inline
-def _record_tangents(equations: Equations, node: int, tangent: _TangentWork, out: Tangents) -> None:
+def _record_tangents(
+    equations: Equations, t_s: Array, before: int, node: int, tangent: _TangentWork, out: Tangents
+) -> None:
+    """Write the derivatives at a node, and at those since the one before, by Hermite's cubics."""
     rows = equations.jacobian
     a = node if rows.shape[0] > 1 else 0
     n = rows.shape[2]
@@ -753,65 +803,88 @@ def _record_tangents(equations: Equations, node: int, tangent: _TangentWork, out
                 height += rows[a, i, j] * tangent.at[j, d]
                 velocity += rows[a, i, j] * tangent.at[n + j, d]
             out.heights[node, i, d] = height
+            tangent.rates[0, i, d] = tangent.rates[1, i, d]
+            tangent.rates[1, i, d] = velocity
             if out.velocities.shape[0] > 0:
                 out.velocities[node, i, d] = velocity
+    gap = t_s[node] - t_s[before]
+    for within in range(before + 1, node):
+        share = (t_s[within] - t_s[before]) / gap
+        for i in range(rows.shape[1]):
+            for d in range(tangent.at.shape[1]):
+                begin = out.heights[before, i, d]
+                rise = out.heights[node, i, d] - begin
+                early = gap * tangent.rates[0, i, d]
+                late = gap * tangent.rates[1, i, d]
+                out.heights[within, i, d] = begin + _cubic(rise, early, late, share)
+                if out.velocities.shape[0] > 0:
+                    turn = early + late - 2.0 * rise
+                    sag = 3.0 * rise - 2.0 * early - late
+                    rate = early + share * (2.0 * sag + 3.0 * share * turn)
+                    out.velocities[within, i, d] = rate / gap
 
 
 @inline
 def _march(
     model: Model, sizes: Integers, calls: _Calls, slopes: _SlopeCalls, scenario: Scenario,
     steps: Steps, directions: Directions, by: ByLinearPart, work: _Work, step: _Step,
-    stages: _Stages, tangent: _TangentWork, out: Trajectory, tangents: Tangents,
+    stages: _Stages, tangent: _TangentWork, out: Trajectory, parts: Integers, tangents: Tangents,
 ) -> bool:  # fmt: skip
     # Laws take bare pointers, because an array would be counted as held and released at each call.
     # The pointers come as arguments: numba has no arithmetic to make them of others in the loop,
     # and to cut an array there for each call takes longer than most laws.
     tabulated = model.equations.jacobian.shape[0] > 1
     farthest_m = 1e3 * steps.stroke_m + 1e3 * abs(model.equations.heights_m[0, 0])
-    nodes = scenario.t_s.shape[0]
+    last = scenario.strides.shape[0] - 1
     size, columns = tangent.x.shape
-    for node in range(nodes):
+    before = 0
+    for stride in range(last + 1):
+        node: int = scenario.strides[stride]
         if columns > 0:
-            _record_tangents(model.equations, node, tangent, tangents)
+            _record_tangents(model.equations, scenario.t_s, before, node, tangent, tangents)
+        parts[stride] = 1
         for substep in range(steps.substeps):
-            span = _span(scenario, steps.substeps, node, substep, tabulated)
-            for i in range(size):
-                step.began[i] = step.x[i]
-                for d in range(columns):
-                    tangent.began[i, d] = tangent.at[i, d]
-            pieces = 1
-            piece = 0
-            while piece < pieces:
-                h = span.step_s / pieces
+            span = _span(scenario, steps.substeps, stride, substep, tabulated)
+            begin = 0
+            length = _PARTS
+            while begin < _PARTS:
+                h = span.step_s * length / _PARTS
+                for i in range(size):
+                    step.began[i] = step.x[i]
                 for stage in range(4):
                     # Nodes of the classical Runge-Kutta method: 0, 1/2, 1/2, 1.
-                    u = (piece + 0.5 * ((stage + 1) // 2)) / pieces
+                    u = (begin + 0.5 * ((stage + 1) // 2) * length) / _PARTS
                     _begin_stage(stage, h, step, work)
                     _write_slope(model, calls, scenario, _instant(span, u), work)
-                    if stage == 0 and substep == 0 and piece == 0 and pieces == 1:
+                    if stage == 0 and substep == 0 and begin == 0 and length == _PARTS:
                         _record(model.equations, node, work, out)
-                        if node + 1 == nodes:
+                        _fill(scenario.t_s, before, node, out)
+                        if stride == last:
                             return True
                     if columns > 0:
                         for i in range(size):
                             stages.x[stage, i] = work.x[i]
                             stages.slope[stage, i] = work.slope[i]
                     _end_stage(stage, h, step, work)
-                if pieces < _MOST_PIECES and _has_jump(h, steps, step, work):
+                jumped = _has_jump(h, steps, step)
+                if jumped and length > 1:
                     # Again, in parts.
                     for i in range(size):
                         step.x[i] = step.began[i]
-                        for d in range(columns):
-                            tangent.at[i, d] = tangent.began[i, d]
-                    pieces = _PIECES if pieces == 1 else _MOST_PIECES
-                    piece = 0
+                    length //= _CUTS
                     continue
+                if not jumped:
+                    _learn_bends(h, step)
+                parts[stride] = max(parts[stride], _PARTS // length)
                 if columns > 0:
                     _step_tangents(
                         model, sizes, calls, slopes, scenario, directions, by, span,
-                        (piece, pieces), stages, work, tangent,
+                        (begin / _PARTS, length / _PARTS), stages, work, tangent,
                     )  # fmt: skip
-                piece += 1
+                begin += length
+                while length < _PARTS and begin % (_CUTS * length) == 0:
+                    length *= _CUTS
+        before = node
         if not abs(work.heights_m[0]) < farthest_m:
             return False
     return True
@@ -822,8 +895,8 @@ def _march(
 _PLACEMENT = types.UniTuple(INTEGERS, 3)
 _EQUATIONS = types.Tuple((CUBE, MATRIX, CUBE, CUBE, CUBE, MATRIX, MATRIX, CUBE, MATRIX, MATRIX))
 _MODEL = types.Tuple((_PLACEMENT, VECTOR, MATRIX, _EQUATIONS))
-_SCENARIO = types.Tuple((*(VECTOR,) * 4, MATRIX, CUBE))
-_STEPS = types.Tuple((I8, F8, F8))
+_SCENARIO = types.Tuple((VECTOR, VECTOR, INTEGERS, VECTOR, VECTOR, MATRIX, CUBE))
+_STEPS = types.Tuple((I8, F8, F8, F8))
 _TRAJECTORY = types.UniTuple(MATRIX, 3)
 _FOUR = types.Array(types.float64, 4, "C")
 _DIRECTIONS = types.Tuple((I8, *(INTEGERS,) * 7, I8))
@@ -836,13 +909,14 @@ def _simulate(
     laws: tuple[Forces, Rates, Rates, Rates],
     sizes: Integers,
     model_parts: tuple[tuple[Integers, ...], Array, Array, Arrays],
-    scenario_parts: Arrays,
-    steps: tuple[int, float, float],
+    scenario_parts: tuple[Array, Array, Integers, Array, Array, Array, Array],
+    steps: tuple[int, float, float, float],
     direction_parts: tuple[
         int, Integers, Integers, Integers, Integers, Integers, Integers, Integers, int
     ],
     linear_parts: Arrays,
     out: Arrays,
+    parts: Integers,
     tangents: Arrays,
 ) -> bool:
     # Pointers hold nothing: what they lead to is held by this function or by its caller.
@@ -858,7 +932,8 @@ def _simulate(
     parameters = np.zeros(SLOTS, dtype=np.int64)
     strut = np.zeros(SLOTS, dtype=np.int64)
     longest = 1
-    for slot in range(placement.struts.shape[0]):
+    effects = placement.struts.shape[0]
+    for slot in range(effects):
         states[slot] = 2 * n + max(placement.first_states[slot], 0)
         parameters[slot] = placement.first_parameters[slot]
         strut[slot] = placement.struts[slot] * struts.shape[1]
@@ -867,20 +942,28 @@ def _simulate(
     work = _Work(
         np.zeros(equations.inputs.shape[2]), start.copy(), np.zeros(size),
         equations.q[0].copy(), equations.v[0].copy(),
-        np.zeros(n), np.zeros(count), np.zeros(count), np.zeros(count),
+        np.zeros(n), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(effects),
     )  # fmt: skip
     calls = _Calls(
         ten(laws[0]), ten(laws[1]),
         pointers(work.x, states), pointers(work.slope, states),
         pointers(model.parameters, parameters), pointers(struts.ravel(), strut),
     )  # fmt: skip
-    step = _Step(start.copy(), start.copy(), np.zeros(size), np.zeros(n))
+    step = _Step(
+        start.copy(), start.copy(), np.zeros(size), np.zeros(effects), np.zeros(effects),
+        np.zeros(effects), np.zeros(effects),
+    )  # fmt: skip
+    for slot in range(effects):
+        row = equations.jacobian[0, placement.struts[slot]]
+        for j in range(n):
+            for i in range(n):
+                step.answer[slot] += row[j] * equations.mass_inverse[0, j, i] * row[i]
     stages = _Stages(np.zeros((4, size)), np.zeros((4, size)))
     tangent = _TangentWork(
         np.zeros((size, columns)), np.zeros((size, columns)), np.zeros((n, columns)),
         np.zeros((count, columns)), np.zeros((count, columns)), np.zeros((count, columns)),
         np.zeros(2 * longest),
-        np.zeros((size, columns)), np.zeros((size, columns)), np.zeros((size, columns)),
+        np.zeros((size, columns)), np.zeros((size, columns)), np.zeros((2, count, columns)),
     )  # fmt: skip
     if directions.start >= 0:
         for i in range(size):
@@ -890,7 +973,7 @@ def _simulate(
     )
     return _march(
         model, sizes, calls, slopes, scenario, Steps(*steps), directions, by, work, step, stages,
-        tangent, Trajectory(*out), Tangents(*tangents),
+        tangent, Trajectory(*out), parts, Tangents(*tangents),
     )  # fmt: skip
 
 
@@ -905,13 +988,24 @@ _simulate = compile_loop(
         _DIRECTIONS,
         _BY_LINEAR_PART,
         _TRAJECTORY,
+        INTEGERS,
         _TANGENTS,
     ),
 )
 
 
-def simulate(slots: Slots, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
+def simulate(
+    slots: Slots,
+    model: Model,
+    scenario: Scenario,
+    steps: Steps,
+    out: Trajectory,
+    parts: Integers | None = None,
+) -> bool:
     """Free-run simulation, written to `out`, by the classical Runge-Kutta method.
+
+    `parts` are filled with the numbers of parts into which a step of each stride was cut at most,
+    shape (S + 1,).
 
     Returns:
         Whether the motion stayed finite.
@@ -925,7 +1019,7 @@ def simulate(slots: Slots, model: Model, scenario: Scenario, steps: Steps, out: 
         np.zeros((0, n, 0)),
     )  # fmt: skip
     tangents = Tangents(np.empty((0, struts, 0)), np.empty((0, struts, 0)))
-    return _start(slots, NO_SLOPES, model, scenario, steps, directions, by, out, tangents)
+    return _start(slots, NO_SLOPES, model, scenario, steps, directions, by, out, tangents, parts)
 
 
 def differentiate(
@@ -949,10 +1043,13 @@ def differentiate(
 def _start(
     slots: Slots, slopes: LawSlopes, model: Model, scenario: Scenario, steps: Steps,
     directions: Directions, by: ByLinearPart, out: Trajectory, tangents: Tangents,
+    parts: Integers | None = None,
 ) -> bool:  # fmt: skip
-    parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
+    whole = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
     laws = slots.laws.forces, slots.laws.rates, slopes.forces, slopes.rates
+    if parts is None:
+        parts = np.empty(len(scenario.strides), dtype=np.int64)
     return _simulate(
-        laws, slots.sizes, parts, tuple(scenario), steps[:], directions[:], by[:], tuple(out),
+        laws, slots.sizes, whole, scenario[:], steps[:], directions[:], by[:], tuple(out), parts,
         tuple(tangents),
     )  # fmt: skip

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_lsq_spline
 
 from dart_model.plant.motion_between import coefficients, evaluate
 from dart_model.spec import ModelSpec, MotionInput
@@ -56,6 +56,19 @@ class InputOverTime(NamedTuple):
             return np.asarray(CubicSpline(self.t_s, self.states)(t_s), dtype=np.float64)
         return _between(self.t_s, self.states, t_s)
 
+    def smoothed(self, nodes_s: Array, t_s: Array) -> "InputOverTime":
+        """The input as a cubic spline between some of all nodes; a motion is smooth as it is.
+
+        That nearest to the values at all nodes keeps the impulse of a force; one through those at
+        some nodes would keep their noise of all frequencies.
+        """
+        if self.noise is not None:
+            return self
+        # Knots as those of the cubic spline through its values, so that both are one.
+        knots = np.concatenate([np.repeat(t_s[0], 4), t_s[2:-2], np.repeat(t_s[-1], 4)])
+        spline = make_lsq_spline(nodes_s, self.at(nodes_s), knots, method="norm-eq")
+        return InputOverTime(t_s, np.asarray(spline(t_s), dtype=np.float64))
+
 
 class Drive(NamedTuple):
     """What drove a recording: the inputs of the model, in its order."""
@@ -74,6 +87,10 @@ class Drive(NamedTuple):
         """
         times = (np.clip(t_s + delay_s, t_s[0], t_s[-1]) for delay_s in delays_s.tolist())
         return np.hstack([item.at(own) for item, own in zip(self.inputs, times, strict=True)])
+
+    def smoothed(self, nodes_s: Array, t_s: Array) -> "Drive":
+        """The drive with forces that are cubic splines between some of all nodes."""
+        return self._replace(inputs=tuple(item.smoothed(nodes_s, t_s) for item in self.inputs))
 
     @property
     def has_force(self) -> bool:

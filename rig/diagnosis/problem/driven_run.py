@@ -12,6 +12,7 @@ from rig.diagnosis.problem.grid import RecordingGrid, Track, fine_times
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 _STEP_ANGLE = 0.2
 """Longest step as an angle of the model's fastest motion: the integrator errs by 1e-5 a radian."""
@@ -24,7 +25,9 @@ class DrivenRun(NamedTuple):
 
     Attributes:
         drive: What drove it.
-        fine: Input vector at half sub-steps, shape (2 * substeps * (N - 1) + 1, inputs).
+        strides: Nodes between which it is simulated in `substeps` each, shape (S + 1,): all of
+            them, or for a faster simulation one in so many.
+        fine: Input vector at half sub-steps, shape (2 * substeps * S + 1, inputs).
         reference_m: Positions of moved bodies there about which the mechanism is linear, shape (as
             above, motions): along its table those that were measured, else zero.
         moved: What moved bodies add to heights and to their rates there, shape (as above, 2,
@@ -36,6 +39,7 @@ class DrivenRun(NamedTuple):
 
     grid: RecordingGrid
     drive: Drive
+    strides: Integers
     fine: Array
     reference_m: Array
     moved: Array
@@ -43,6 +47,11 @@ class DrivenRun(NamedTuple):
     angle: float
     mechanism: LinearisedMechanism
     cells: tuple[Array, Array] | None
+
+    @property
+    def fastest(self) -> float:
+        """Largest eigenvalue of the model, by size, in rad/s."""
+        return self.angle * self.substeps * (len(self.strides) - 1) / self.grid.duration_s
 
     @property
     def inputs(self) -> Array:
@@ -70,6 +79,7 @@ class DrivenRun(NamedTuple):
             cells = cells[0][there], cells[1][there]
         return self._replace(
             grid=grid,
+            strides=np.arange(len(grid.t_s)),
             fine=self.fine[fine],
             reference_m=self.reference_m[fine],
             moved=self.moved[fine],
@@ -92,7 +102,7 @@ class DrivenRun(NamedTuple):
         """The recording with its inputs as they were, measured with a delay each, (inputs,)."""
         if not np.any(delays_s):
             return self
-        times = fine_times(self.grid.t_s, 2 * self.substeps)
+        times = fine_times(self.grid.t_s[self.strides], 2 * self.substeps)
         return self.driven_by(np.ascontiguousarray(self.drive.before_delays(times, delays_s)))
 
     def disturbed(self, noise: Array) -> "DrivenRun":
@@ -101,8 +111,25 @@ class DrivenRun(NamedTuple):
 
     def driven_by(self, fine: Array) -> "DrivenRun":
         """The recording with another input vector, as `fine`."""
-        moved = _moved(self.drive, self.mechanism, fine, self.reference_m)
+        moved = _moved(self.drive, self.mechanism, self.strides, fine, self.reference_m)
         return self._replace(fine=fine, moved=moved)
+
+    def in_strides(self, every: int) -> "DrivenRun":
+        """The recording simulated in steps of so many nodes, which show its forces smoothed."""
+        strides = np.append(np.arange(0, len(self.grid.t_s) - 1, every), len(self.grid.t_s) - 1)
+        times = fine_times(self.grid.t_s[strides], 2)
+        drive = self.drive.smoothed(self.grid.t_s, self.grid.t_s[strides])
+        fine = np.ascontiguousarray(drive.at(times), dtype=np.float64)
+        reference = _reference(self.mechanism, drive, fine)
+        return self._replace(
+            drive=drive,
+            strides=strides,
+            fine=fine,
+            reference_m=reference,
+            moved=_moved(drive, self.mechanism, strides, fine, reference),
+            substeps=1,
+            angle=self.angle * self.substeps * every,
+        )
 
 
 def track_of(motion: Trajectory, run: DrivenRun) -> Track:
@@ -124,18 +151,17 @@ def driven_run(
 
     `fastest` is the model's largest eigenvalue in rad/s.
     """
-    usual = grid.step_s
+    usual, strides = grid.step_s, np.arange(len(grid.t_s))
     substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))
     fine = np.ascontiguousarray(drive.at(fine_times(grid.t_s, 2 * substeps)), dtype=np.float64)
-    reference = (
-        fine[:, drive.moved] if mechanism.is_tabulated else np.zeros((len(fine), len(drive.moved)))
-    )
+    reference = _reference(mechanism, drive, fine)
     return DrivenRun(
         grid,
         drive,
+        strides,
         fine,
         reference,
-        _moved(drive, mechanism, fine, reference),
+        _moved(drive, mechanism, strides, fine, reference),
         substeps,
         fastest * usual / substeps,
         mechanism,
@@ -143,12 +169,22 @@ def driven_run(
     )
 
 
-def _moved(drive: Drive, mechanism: LinearisedMechanism, fine: Array, reference: Array) -> Array:
+def _reference(mechanism: LinearisedMechanism, drive: Drive, fine: Array) -> Array:
+    """Positions about which a mechanism is linear, as `DrivenRun.reference_m`."""
+    if mechanism.is_tabulated:
+        return fine[:, drive.moved]
+    return np.zeros((len(fine), len(drive.moved)))
+
+
+def _moved(
+    drive: Drive, mechanism: LinearisedMechanism, strides: Integers, fine: Array, reference: Array
+) -> Array:
     """What moved bodies add to heights and to their rates, as `DrivenRun.moved`."""
     if not drive.moved:
         return np.empty((0, 2, mechanism.heights_m.shape[1]))
     jacobian = mechanism.moved
     if mechanism.is_tabulated:
+        jacobian = jacobian[strides]
         share = np.linspace(0.0, len(jacobian) - 1.0, len(fine))
         before = np.minimum(share.astype(np.int64), len(jacobian) - 2)
         share = (share - before)[:, np.newaxis, np.newaxis]

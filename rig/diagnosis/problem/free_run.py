@@ -87,10 +87,18 @@ Array = NDArray[np.float64]
 
 _BEND = 4.0
 """How much more than its fastest linear motion a smooth nonlinear one may bend within a step."""
+_JUMP = 2e-8
+"""Change of height within a step by a jump of force, as a share of the stroke, from which on the
+step is cut."""
 _LEVEL_DRAWS, _FLOOR_DRAWS = 3, 8
 """Draws of the applied force's noise. Their mean square is known to a third with three; of a floor
 the largest counts, since a lightly damped motion answers to it in so few independent swings that
 their RMS scatters by a third."""
+_LONGER_ANGLE, _LONGER_ERROR = 0.15, 0.02
+"""Longest steps of fits that search: angle of the fastest motion within one, and RMS of what they
+change, as a share of the noise: it makes the sum of squares of 10 000 samples larger by 4."""
+_LEAST_STRIDES = 16
+"""Strides of the shortest recording, at least: a spline has four knots at either end."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
 """Share of the noise, or of the error if that is more, to which DART's steps are refined."""
 _FORCE_STEP_S = 0.5e-3
@@ -108,11 +116,18 @@ _IMPLAUSIBLE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class FreeRunProblem(Problem):
-    """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
+    """A model and recordings of a driven bench.
+
+    Attributes:
+        noise_m: Standard deviation of each measured height, shape (struts,).
+        in_strides: The recordings as fits simulate laws without internal states, where that is in
+            longer steps, or empty. Internal states settle as fast as usual steps are long.
+    """
 
     bench: ClassVar[Bench] = "force_given"
     runs: tuple[DrivenRun, ...]
     noise_m: Array
+    in_strides: tuple[DrivenRun, ...] = ()
 
     @classmethod
     def of_recordings(
@@ -167,9 +182,42 @@ class FreeRunProblem(Problem):
     def grids(self) -> tuple[RecordingGrid, ...]:
         return tuple(run.grid for run in self.runs)
 
+    def coarser(self, model: CandidateModel) -> "FreeRunProblem":
+        usual = self.runs[0]
+        for every in range(self._longest_stride(), 0, -1):
+            if every == usual.substeps == 1:
+                break
+            runs = tuple(run.in_strides(every) for run in self.runs)
+            if self._move_alike(runs, model):
+                return replace(self, in_strides=runs)
+        return self
+
+    def _longest_stride(self) -> int:
+        """Most nodes in a step in which neither the model nor its measured motion turns far."""
+        step_s = min(
+            _LONGER_ANGLE / max(run.fastest for run in self.runs),
+            *(_LONGER_ANGLE * 0.5 * m.stroke_m / m.top_speed_m_per_s for m in self.motions),
+        )
+        longest = int(step_s / max(run.grid.step_s for run in self.runs) + 1e-6)
+        return min(longest, min(len(run.grid.t_s) for run in self.runs) // _LEAST_STRIDES)
+
+    def _move_alike(self, runs: Sequence[DrivenRun], model: CandidateModel) -> bool:
+        """Whether a model moves in other steps as in usual ones."""
+        for k, (usual, other) in enumerate(zip(self.runs, runs, strict=True)):
+            motions = [self.simulate(run, model, model.parts.starts[k]) for run in (usual, other)]
+            if motions[0] is None or motions[1] is None:
+                return False
+            change = (motions[1].heights_m - motions[0].heights_m) / self.noise_m
+            if rms(change) > _LONGER_ERROR:
+                return False
+        return True
+
+    def in_usual_steps(self) -> "FreeRunProblem":
+        return replace(self, in_strides=())
+
     def finer(self) -> "FreeRunProblem":
         """The problem with steps half as long: the integrator then errs a sixteenth."""
-        return replace(self, runs=tuple(run.finer() for run in self.runs))
+        return replace(self, runs=tuple(run.finer() for run in self.runs), in_strides=())
 
     def fit_nodes(self, k: int) -> Flags:
         return self.runs[k].grid.fitted
@@ -250,6 +298,12 @@ class FreeRunProblem(Problem):
         """A recording with its inputs as they were before their delays."""
         return self.runs[k].before_delays(self._delays(model).inputs)
 
+    def _in_fits(self, k: int, model: CandidateModel) -> DrivenRun:
+        """The same, as fits simulate it."""
+        runs = self.runs if slots_of(self, model.candidate).states else self.in_strides or self.runs
+        run = runs[k]
+        return run.before_delays(self._delays(model).inputs)
+
     # --- the residual in simulation ---------------------------------------------------------------
 
     def simulate(self, run: DrivenRun, model: CandidateModel, start: Array) -> Trajectory | None:
@@ -260,6 +314,14 @@ class FreeRunProblem(Problem):
         motion = self._empty_motion(run)
         slots = slots_of(self, model.candidate)
         return motion if simulate(slots, *prepared, motion) else None
+
+    def _parts(self, run: DrivenRun, model: CandidateModel, start: Array) -> Integers:
+        """Parts into which a model's step at each node is cut where a force jumps, shape (N,)."""
+        parts = np.ones(len(run.strides), dtype=np.int64)
+        prepared = self._prepare(run, model, start)
+        if prepared is not None:
+            simulate(slots_of(self, model.candidate), *prepared, self._empty_motion(run), parts)
+        return parts
 
     def _prepare(
         self, run: DrivenRun, model: CandidateModel, start: Array
@@ -283,12 +345,13 @@ class FreeRunProblem(Problem):
             Scenario(
                 start,
                 run.grid.t_s,
+                run.strides,
                 run.drive.applied_n(run.fine),
                 run.grid.temperature_c,
                 run.fine,
                 run.moved,
             ),
-            Steps(run.substeps, _BEND * run.angle**2, self._stroke_m),
+            Steps(run.substeps, _BEND * run.angle**3, _JUMP * self._stroke_m, self._stroke_m),
         )
 
     def _empty_motion(self, run: DrivenRun) -> Trajectory:
@@ -297,7 +360,7 @@ class FreeRunProblem(Problem):
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Measured less simulated heights over the noise, at the fitted nodes, flat."""
-        run = self._before_delays(k, model)
+        run = self._in_fits(k, model)
         motion = self.simulate(run, model, model.parts.starts[k])
         return None if motion is None else self._compare(k, model, motion)
 
@@ -314,7 +377,7 @@ class FreeRunProblem(Problem):
         return self._differentiate
 
     def _differentiate(self, k: int, model: CandidateModel, varied: Flags) -> Array | None:
-        run, parts = self._before_delays(k, model), model.parts
+        run, parts = self._in_fits(k, model), model.parts
         prepared = self._prepare(run, model, parts.starts[k])
         if prepared is None:
             return None
@@ -360,7 +423,7 @@ class FreeRunProblem(Problem):
         if self.linear[parameter].input < 0:
             ahead, behind = (self._compare(k, other, motion) for other in (more, less))
             return (ahead - behind) / (2.0 * step)
-        moved = self.simulate(self._before_delays(k, more), more, model.parts.starts[k])
+        moved = self.simulate(self._in_fits(k, more), more, model.parts.starts[k])
         if moved is None:
             return None
         return (self._compare(k, more, moved) - self._compare(k, model, motion)) / step
@@ -693,8 +756,8 @@ class FreeRunProblem(Problem):
     ) -> RunEvaluation:
         """Figures of a held-out recording: heights are DART's, driven as measured."""
         del fitted_rms_n
-        run = self.runs[k]
-        grid, rows = run.grid, select_nodes(run.grid, blocks=blocks)
+        grid = self.runs[k].grid
+        rows = select_nodes(grid, blocks=blocks)
         measured = np.where(rows[:, np.newaxis], grid.heights_m, np.nan)
         simulated = [
             self.simulate(self._before_delays(k, model), model, model.parts.starts[k])
@@ -723,9 +786,9 @@ class FreeRunProblem(Problem):
             error_m = rms(measured - heights_m)
             tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
             start, expected_m = model.parts.starts[k], motion.heights_m
-            found_m = on_dart.dart_heights(
-                self, self._before_delays(k, model), model, start, expected_m, tolerance_m
-            )
+            run = self._before_delays(k, model)
+            parts = self._parts(run, model, start)
+            found_m = on_dart.dart_heights(self, run, model, start, expected_m, tolerance_m, parts)
             on_dart_m.append(self._as_read(k, model, found_m, None))
         forces = [self.residual_forces(k, model) for model in models]
         before_n, linear_n, after_n = (

@@ -12,9 +12,8 @@ from rig.diagnosis.problem.linear_part import round_for_file, spec_with_linear_c
 from rig.diagnosis.problem.problem import CandidateModel, Problem, rms, slots_of
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-_TRIED_S = 4.0
-"""Length of the part of a recording on which the number of DART's steps is determined."""
 _MOST_STEPS = 32
 """Steps of DART between two nodes from which on no more are tried."""
 _MOST_STEPS_IN_ALL = 1_500_000
@@ -61,27 +60,29 @@ def dart_heights(
     start: Array,
     expected_m: Array,
     tolerance_m: float,
+    parts: Integers | None = None,
 ) -> Array:
     """Heights of a model in free run in DART, shape (N, struts).
 
     Its steps are refined until its heights differ from `expected_m`, those of the same model as the
     diagnosis simulates it, or from those with steps of twice the length, by less than `tolerance_m`
-    RMS: where joints turn, a model that does not follow the bench moves otherwise in DART.
+    RMS: where joints turn, a model that does not follow the bench moves otherwise in DART. They are
+    so many times shorter after each node as `parts` (N,) has it: where forces jump.
     """
     plant = DartPlant(spec_with_corrections(problem, model))
     nodes = len(run.grid.t_s)
-    tried = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
     states = _plant_states(problem, model, start[2 * plant.free_coordinates :], plant)
-    steps, heights_m = run.substeps, expected_m
-    for count in (tried, nodes):  # The first seconds show what suffices at least.
-        known = [expected_m[:count]]
-        while True:
-            heights_m = _simulate_heights(plant, run, (states, start), count, steps)
-            is_fine = any(rms(heights_m - other) < tolerance_m for other in known)
-            if is_fine or steps >= _MOST_STEPS or 2 * steps * nodes > _MOST_STEPS_IN_ALL:
-                break
-            known, steps = [expected_m[:count], heights_m], 2 * steps
-    return heights_m
+    steps = np.full(nodes, run.substeps)
+    if parts is not None and run.substeps * int(parts.sum()) <= _MOST_STEPS_IN_ALL:
+        steps *= parts
+    known = [expected_m]
+    while True:
+        heights_m = _simulate_heights(plant, run, (states, start), steps)
+        is_fine = any(rms(heights_m - other) < tolerance_m for other in known)
+        least, most = 2 * int(steps.min()), 2 * int(steps.sum())
+        if is_fine or least > _MOST_STEPS or most > _MOST_STEPS_IN_ALL:
+            return heights_m
+        known, steps = [expected_m, heights_m], 2 * steps
 
 
 def _plant_states(
@@ -102,32 +103,39 @@ def _plant_states(
 
 
 def _simulate_heights(
-    plant: DartPlant, run: DrivenRun, begin: tuple[tuple[float, ...], Array], count: int, steps: int
+    plant: DartPlant, run: DrivenRun, begin: tuple[tuple[float, ...], Array], steps: Integers
 ) -> Array:
-    """Heights (count, struts) at the first nodes; `begin`: internal states, initial vector."""
+    """Heights (N, struts) in so many steps after each node, (N,).
+
+    `begin` are internal states and the initial vector.
+    """
     states, start = begin
     grid = run.grid
-    n, inputs = plant.free_coordinates, _interpolate_inputs(run, count, steps)
+    count = len(grid.t_s)
+    n, inputs = plant.free_coordinates, _interpolate_inputs(run, steps)
     numbers = (*start[: 2 * n].tolist(), *states)
     state = plant.state_of(numbers, float(grid.t_s[0]), inputs[0].tolist())
     drive = inputs.tolist()
     no_forces = (0.0,) * len(plant.spec.struts)
     heights = np.empty((count, len(no_forces)))
-    lengths = (np.diff(grid.t_s[:count]) / steps).tolist()
+    lengths, step = (np.diff(grid.t_s) / steps[:-1]).tolist(), 0
     temperature = grid.temperature_c.tolist()
     for k in range(count):
         heights[k] = [height_m for height_m, _ in state.struts]
         if k + 1 == count:
             break
-        for step in range(steps):
-            loaded = plant.load(state, no_forces, drive[steps * k + step], temperature[k])
-            state = plant.step(loaded, lengths[k], drive[steps * k + step + 1])
+        for _ in range(steps[k]):
+            loaded = plant.load(state, no_forces, drive[step], temperature[k])
+            step += 1
+            state = plant.step(loaded, lengths[k], drive[step])
     return heights
 
 
-def _interpolate_inputs(run: DrivenRun, count: int, steps: int) -> Array:
-    """Input vector at `steps` points between nodes, shape (steps * (count - 1) + 1, inputs)."""
-    parts = 2 * run.substeps
-    fine = run.fine[: parts * (count - 1) + 1]
-    at = np.linspace(0.0, count - 1.0, len(fine))
-    return CubicSpline(at, fine)(np.linspace(0.0, count - 1.0, steps * (count - 1) + 1))
+def _interpolate_inputs(run: DrivenRun, steps: Integers) -> Array:
+    """Input vector at so many points from each node on, and at the last node."""
+    nodes = np.arange(len(steps) - 1)
+    first = np.cumsum(steps) - steps
+    within = np.arange(first[-1]) - np.repeat(first[:-1], steps[:-1])
+    wanted = np.repeat(nodes, steps[:-1]) + within / np.repeat(steps[:-1], steps[:-1])
+    at = np.linspace(0.0, len(nodes), len(run.fine))
+    return CubicSpline(at, run.fine)(np.append(wanted, len(nodes)))

@@ -202,6 +202,15 @@ class PrescribedProblem(Problem):
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
 
+    def coarser(self, model: CandidateModel) -> "PrescribedProblem":
+        """The problem itself: nothing is integrated."""
+        del model
+        return self
+
+    def in_usual_steps(self) -> "PrescribedProblem":
+        """The problem itself, likewise."""
+        return self
+
     def finer(self) -> None:
         """None: nothing is integrated."""
         return

@@ -308,8 +308,19 @@ class Problem(ABC):
         """The problem with the sensors' noise as a model's residual shows it."""
 
     @abstractmethod
+    def coarser(self, model: CandidateModel) -> Self:
+        """The problem with fits in longer steps, as far as a model moves alike in them.
+
+        Laws with internal states are fitted in usual steps.
+        """
+
+    @abstractmethod
+    def in_usual_steps(self) -> Self:
+        """The problem with all fits in usual steps."""
+
+    @abstractmethod
     def finer(self) -> Self | None:
-        """The problem with steps half as long; None where nothing is integrated."""
+        """The problem with steps half as long as usual ones; None where nothing is integrated."""
 
     @abstractmethod
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> Self:

@@ -33,6 +33,8 @@ Flags = NDArray[np.bool_]
 
 _SCALED_BY_GAIN = ("mass", "stiffness", "damping")
 """Linear parameters that, changed in one proportion, are another gain of the applied force."""
+_GENERAL = 2
+"""Laws of a family that are tried for a simpler one, best along the motion first."""
 _MORE_FITS, _STILL_FALLING = 3, 0.95
 """Fits of a simpler model in addition, as long as each reduces its cost by a twentieth."""
 _ALIKE = 0.01
@@ -164,15 +166,47 @@ def _simpler_models(
     less = chosen.fit.candidate.without(law)
     if chosen.size > 1:
         progress(f"fitting without {law[1]}", 0.85)
-        # Its first fit may have ended in a side valley, which the larger model has left.
+        # Its first fit may have ended in a side valley, which the larger model has left; and the
+        # larger model's linear part may suit its laws alone.
         is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
         is_fitted |= less in pool.converged and less in pool.invalid
         if not is_fitted:
             along = refine(stage, less.new, [known[other] for other in less.new])
             if along is not None and along.validation_cost <= most():
                 pool.attempt(model_for(pool.problem, chosen.fit.model, less))
+                pool.attempt_screening(stage, pool.linear, along)
         yield from _converge_candidate(pool, less, chosen)
+        yield from _with_more_general(pool, less, chosen, progress)
     yield from _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
+
+
+def _with_more_general(
+    pool: Pool, less: Candidate, chosen: ValidatedModel, progress: Progress
+) -> Iterable[ValidatedModel]:
+    """Smaller models with a more general law of a family for one of theirs.
+
+    What a chosen model's laws leave without one of them may be due to their formulas: the valves of
+    a damper stood in for what Coulomb's friction lacks of Stribeck's.
+    """
+    model = pool.fits.get(less)
+    if model is None or less in pool.invalid or not pool.is_formula(model):
+        return
+    known = law_values(pool.problem, model.fit)
+    for law in less.new:
+        others = less.without(law)
+        general = [at for at in candidate_laws(pool.problem) if _is_more_general(at, law)]
+        progress(f"fitting more general laws than {law[1]}", 0.85)
+        base = as_screening(others.new, known)
+        for screening in rank_laws(pool.linear_stage, base, len(general), general)[:_GENERAL]:
+            candidate = others.with_effects(screening.laws[-1])
+            if screening.values and candidate not in pool.fits:
+                pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
+            yield from _converge_candidate(pool, candidate, chosen)
+
+
+def _is_more_general(law: StrutEffect, other: StrutEffect) -> bool:
+    a, b = effect(law[1]), effect(other[1])
+    return law[0] == other[0] and a.family == b.family and b.name in a.simpler
 
 
 def _with_one_of(

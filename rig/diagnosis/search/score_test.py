@@ -28,6 +28,7 @@ from rig.diagnosis.problem.problem import (
     CandidateModel,
     Problem,
     StrutEffect,
+    slots_of,
     strut_constants,
 )
 from rig.diagnosis.problem.track import law_force, linear_forces
@@ -67,6 +68,8 @@ class _Base(NamedTuple):
     Attributes:
         basis: Orthonormal basis of the responses to the fitted variables, shape (m, k).
         residual: The residual without its projection on the basis, shape (m,).
+        usual: The problem in usual steps, in which laws with internal states are simulated, and the
+            model's residual there, shape (m,).
     """
 
     problem: Problem
@@ -75,6 +78,7 @@ class _Base(NamedTuple):
     constants: Array
     basis: Array
     residual: Array
+    usual: tuple[Problem, Array]
 
 
 class _ReplacedLaw(NamedTuple):
@@ -97,7 +101,8 @@ def find_changes(
     """Changes of a fitted model by one law, each at its best start, best first."""
     constants = strut_constants(problem, result.parts.linear)
     tracks = tuple(track for _, track in motions)
-    base = _Base(problem, result, tracks, constants, *_project_out_fit(result))
+    usual = _in_usual_steps(problem, result)
+    base = _Base(problem, result, tracks, constants, *_project_out_fit(result), usual)
     laws = result.candidate.new
     additions = _additions(base) if len(laws) < most_laws else []
     exchanges = list(_exchanges(base))
@@ -122,6 +127,12 @@ def _project_out_fit(result: Fit) -> tuple[Array, Array]:
     size = np.linalg.norm(whole, axis=0)
     basis = np.linalg.qr(whole[:, size > 0.0] / size[size > 0.0])[0][: len(jacobian)]
     return basis, result.residual - basis @ (basis.T @ result.residual)
+
+
+def _in_usual_steps(problem: Problem, result: Fit) -> tuple[Problem, Array]:
+    usual = problem.in_usual_steps()
+    residual = whiten_residual(usual, result.model)
+    return usual, result.residual if residual is None else residual
 
 
 def _additions(base: _Base) -> list[tuple[StrutEffect, Array]]:
@@ -212,12 +223,16 @@ def _response(base: _Base, candidate: Candidate, at: StrutEffect, values: Array)
 
     None where the model runs away.
     """
+    # Both in the same steps: the change is small, and what steps change is not.
+    problem, before = base.problem, base.fit.residual
+    if any(slots_of(problem, laws).states for laws in (candidate, base.fit.candidate)):
+        problem, before = base.usual
     residual = whiten_residual(
-        base.problem, model_for(base.problem, base.fit.model, candidate, {at: values})
+        problem, model_for(base.problem, base.fit.model, candidate, {at: values})
     )
     if residual is None:
         return None
-    column = base.fit.residual - residual
+    column = before - residual
     return column - base.basis @ (base.basis.T @ column)
 
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.diagnosis.outcome import Array, FittedSeries, HeldOutSeries, NoiseFloor
+from dart_model.effects import effect
+from rig.diagnosis.outcome import Array, FittedSeries, FoundEffect, HeldOutSeries, NoiseFloor
 from rig.pages.plotted_quantities import (
     FREQUENCY,
     HEIGHT,
@@ -63,8 +64,9 @@ class Panel(NamedTuple):
         curves: Style of each line.
         values: Ordinates of each curve, shape (N,); the cells' values, row by row, for ``cells``.
         extra: Further options of the page's script: `title`, `reach` of a grey band about zero,
-            `marks` where recordings begin, `log` for both axes, `y_range`, `gaps` that are bridged,
-            `steps` of a histogram, and `largest` and `y` of the cells.
+            `marks` where recordings begin, `acting` parts of the abscissa below the curves, `log`
+            for both axes, `y_range`, `gaps` that are bridged, `steps` of a histogram, and
+            `largest` and `y` of the cells.
     """
 
     kind: str
@@ -104,12 +106,17 @@ def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
 
 
 def finding_plot(
-    key: str, series: Sequence[FittedSeries], points: int, *, corrected: bool
+    key: str,
+    series: Sequence[FittedSeries],
+    points: int,
+    acting: FoundEffect | None,
+    *,
+    corrected: bool,
 ) -> Plot | None:
     """Residual force over the coordinate that shows it best, its correction and what is left.
 
     The correction is the mean over the recordings at each height, or at each velocity; where
-    nothing was corrected, it is that of the residual force.
+    nothing was corrected, it is that of the residual force. A bar is where `acting` shows.
     """
     joined = _residuals(series)
     there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
@@ -143,10 +150,21 @@ def finding_plot(
         against[kept],
         styles,
         values,
-        {"reach": _finite(_reach_n(joined))},
+        {"reach": _finite(_reach_n(joined)), "acting": _acting_parts(acting, column)},
     )
     caption = f"The force that the nominal model lacks, over {quantity.name} ({_SMOOTHED_BAND})."
+    if acting is not None:
+        caption += f" The bar below is where the recordings show {effect(acting.name).words}."
     return plot(key, "Residual force", caption, [panel], 1)
+
+
+def _acting_parts(acting: FoundEffect | None, column: int) -> list[list[float]]:
+    """Parts of the height, or of the velocity, in the figure's units."""
+    if acting is None or acting.where is None:
+        return []
+    parts = (acting.where.height_m, acting.where.velocity_m_per_s)[column]
+    factor = (HEIGHT, VELOCITY)[column].factor
+    return [[factor * low, factor * high] for low, high in parts]
 
 
 _BINS = 60

@@ -14,7 +14,7 @@ const scaled = (values, factor) => (factor === 1 ? values : values.map((v) => (v
 function draw(element, original) {
   const [ofX, xLabel] = Units.axis(original.xLabel);
   const [ofY, yLabel] = Units.axis(original.yLabel);
-  const panel = { ...original, xLabel, yLabel, reach: original.reach && original.reach * ofY, y_range: original.y_range && scaled(original.y_range, ofY) };
+  const panel = { ...original, xLabel, yLabel, reach: original.reach && original.reach * ofY, y_range: original.y_range && scaled(original.y_range, ofY), acting: original.acting?.map((part) => scaled(part, ofX)) };
   const x = scaled(unpacked(panel.x, Float64Array), ofX);
   const values = panel.values.map((text) => (panel.kind === "cells" ? unpacked(text) : scaled(unpacked(text), ofY)));
   const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points" && !curve.is_line, spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));

@@ -135,7 +135,9 @@ def _finding_plot(result: Result) -> Plot | None:
     }
     most = by_strut[max(lacking, key=lacking.__getitem__)]
     diagnosis = result.diagnosis
-    drawn = finding_plot("first", most, _POINTS, corrected=_has_corrections(diagnosis))
+    there = (item for item in diagnosis.effects if item.strut == most[0].strut and item.where)
+    corrected = _has_corrections(diagnosis)
+    drawn = finding_plot("first", most, _POINTS, next(there, None), corrected=corrected)
     if drawn is None or not diagnosis.ambiguous_with:
         return drawn
     rivals = join_words([FAMILY_WORDS[family] for family in diagnosis.ambiguous_with], "or")

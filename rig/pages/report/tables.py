@@ -18,6 +18,7 @@ from rig.pages.number_formats import (
 )
 from rig.pages.report.words import (
     LINEAR,
+    acting_words,
     difference,
     evidence_words,
     is_prescribed,
@@ -154,6 +155,8 @@ def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
         )
         if item.evidence is not None:
             note += f". {evidence_words(item.evidence)}"
+        if item.where is not None:
+            note += f". {acting_words(item.where)}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))
     return tuple(tables)
 

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import (
+    ActingRange,
     ChannelCorrection,
     Diagnosis,
     Estimate,
     Evidence,
     FoundEffect,
+    Interval,
     LikelihoodGain,
     LinearCorrection,
 )
@@ -227,6 +229,34 @@ def evidence_words(evidence: Evidence) -> str:
         laws = join_words([effect(name).words for name in evidence.rival.over], "and")
         text += f"; with the nearest other explanation ({laws}) it is {_gain(evidence.rival)}"
     return f"{text}. {capital(CONFIRMATIONS[evidence.held_out])}"
+
+
+_ALL = 0.95
+"""Share of a recorded range from which on an effect acts in all of it."""
+
+
+def acting_words(where: ActingRange) -> str:
+    """Where along stroke and speed the recordings show an effect, and how far they reach."""
+    heights = _parts(where.height_m, where.recorded_height_m, "heights", "m")
+    velocities = _parts(
+        where.velocity_m_per_s, where.recorded_velocity_m_per_s, "velocities", "m/s"
+    )
+    return f"It shows {heights}, and {velocities}; of others the recordings say nothing"
+
+
+def _parts(shown: Sequence[Interval], recorded: Interval, name: str, unit: str) -> str:
+    reach = _from_to(recorded, unit)
+    share = sum(high - low for low, high in shown) / max(recorded[1] - recorded[0], 1e-300)
+    if share > _ALL:
+        return f"at all recorded {name} ({reach})"
+    if not shown:
+        return f"at no part of the recorded {name} by itself ({reach})"
+    parts = join_words([_from_to(part, unit) for part in shown], "and")
+    return f"at {name} {parts} (recorded {reach})"
+
+
+def _from_to(interval: Interval, unit: str) -> str:
+    return f"from {quantity(interval[0], unit)} to {quantity(interval[1], unit)}"
 
 
 def _gain(gain: LikelihoodGain) -> str:
