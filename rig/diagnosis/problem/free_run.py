@@ -94,9 +94,10 @@ _LEVEL_DRAWS, _FLOOR_DRAWS = 3, 8
 """Draws of the applied force's noise. Their mean square is known to a third with three; of a floor
 the largest counts, since a lightly damped motion answers to it in so few independent swings that
 their RMS scatters by a third."""
-_LONGER_ANGLE, _LONGER_ERROR = 0.15, 0.02
-"""Longest steps of fits that search: angle of the fastest motion within one, and RMS of what they
-change, as a share of the noise: it makes the sum of squares of 10 000 samples larger by 4."""
+_LONGER_ANGLE, _LONGER_ERROR = 0.08, 0.02
+"""Longest steps of fits that search: angle of the fastest motion within one (with twice as much a
+stop errs by a quarter of usual noise), and RMS of what they change of the best linear model, as a
+share of the noise: it makes the sum of squares of 10 000 samples larger by 4."""
 _LEAST_STRIDES = 16
 """Strides of the shortest recording, at least: a spline has four knots at either end."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
