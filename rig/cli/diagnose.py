@@ -1,5 +1,6 @@
 """`rig diagnose`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,16 @@ def diagnose(
             "Without it, blocks of RUN are held out.",
         ),
     ] = None,
+    level: Annotated[
+        float,
+        typer.Option(
+            metavar="P",
+            min=1e-9,
+            max=0.2,
+            help="Probability that an effect is named where none is missing, and that a rival is "
+            "ruled out by chance.",
+        ),
+    ] = 0.01,
     label: Labels = None,
     pdf: PrintToo = False,
     as_json: JsonFlag = False,
@@ -40,6 +51,7 @@ def diagnose(
     from dart_model.spec import load_named_model
     from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json
+    from rig.diagnosis.search.criteria import CRITERIA
     from rig.pages.browser_print import find_browser, print_page
     from rig.pages.identity import parse_labels
     from rig.pages.report import write_report
@@ -56,7 +68,8 @@ def diagnose(
             "then."
         )
     with progress_bar() as bar:
-        result = diagnose_runs(runs, spec, held_out or [], out, bar)
+        criteria = replace(CRITERIA, level=level)
+        result = diagnose_runs(runs, spec, held_out or [], out, bar, criteria)
         write_report(result, out / REPORT_FILE, labels)
         if pdf:
             print_page(out / REPORT_FILE, out / "report.pdf")

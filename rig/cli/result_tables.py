@@ -93,7 +93,7 @@ def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
         print_table(("effect", "value", "95 % interval"), rows, "Missing effects")
         for found in missing(diagnosis):
             if found.evidence is not None:
-                print_text(f"- {found.name}: {evidence_words(found.evidence)}.")
+                print_text(f"- {found.name}: {evidence_words(found.evidence, diagnosis.level)}.")
     for law, note, parameters in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in parameters]
         print_text(f"- {law.name}, {'; '.join((note, *values))}")

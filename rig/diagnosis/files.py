@@ -18,13 +18,19 @@ from rig.diagnosis.outcome import (
     write_results,
 )
 from rig.diagnosis.progress import Progress
+from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.log.file_names import RUN_FILE
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
 
 
 def diagnose_runs(
-    runs: Sequence[Path], model: ModelSpec, held_out: Sequence[Path], out: Path, progress: Progress
+    runs: Sequence[Path],
+    model: ModelSpec,
+    held_out: Sequence[Path],
+    out: Path,
+    progress: Progress,
+    criteria: SelectionCriteria = CRITERIA,
 ) -> Result:
     """Diagnose runs (folders or CSV files); write diagnosis and corrected model into `out`.
 
@@ -42,7 +48,7 @@ def diagnose_runs(
     recordings = [read_recording(path, names) for path in paths]
     learnt, evaluated = recordings[: len(runs)], recordings[len(runs) :]
     result = replace(
-        diagnose(model, learnt, evaluated, progress),
+        diagnose(model, learnt, evaluated, progress, criteria),
         sources=(
             DiagnosisSource(
                 "nominal model", model.name, sha256(dump_model(model).encode()).hexdigest()

@@ -100,7 +100,7 @@ class LikelihoodGain:
         log_likelihood: Gain of its logarithm; the noise is what the corrected model leaves, at
             least the sensors'.
         error_ratio: RMS residual of the other model over that of the corrected one; it is beyond
-            each end with the level at which rivals are distinguished.
+            each end with the diagnosis's level; over a model without a law, over all laws together.
     """
 
     over: tuple[str, ...]
@@ -331,6 +331,7 @@ class Diagnosis:
         model: Name of the nominal model.
         damper: Forces of the dampers that laws describe, by velocity; empty without such a law.
         channels: Corrections of the measurement.
+        level: Probability of a name where none is missing, which was asked for.
     """
 
     verdict: Verdict
@@ -349,6 +350,7 @@ class Diagnosis:
     damper: tuple[DamperForce, ...] = ()
     channels: tuple[ChannelCorrection, ...] = ()
     left: float | None = None
+    level: float = 0.01
 
 
 @dataclass(frozen=True)

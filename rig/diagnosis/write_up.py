@@ -184,6 +184,7 @@ def compose_result(
         damper_forces(problem, chosen, estimates.covariance, after),
         channels,
         search.left,
+        criteria.level,
     )
     models = search.given.model, chosen.model
     series = (_collect_series(problem, k, models, (before[k], after[k])) for k in recordings)

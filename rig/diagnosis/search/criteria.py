@@ -35,8 +35,9 @@ class SelectionCriteria:
             model is preferred: the one-standard-error rule (Breiman et al., Classification and
             Regression Trees, 1984, 3.4.3). With more, effects of few blocks would be lost: an
             effect that acts in k blocks alone gains sqrt(k) standard errors.
-        level: Probability that a rival which is right, and as plain, is distinguished from the
-            chosen model by chance: of Student's distribution of the logarithm of the residuals'
+        level: Probability that any law is named where none is missing (Bonferroni, over all laws
+            that are searched), and that a rival which is right, and as plain, is distinguished from
+            the chosen model by chance: of Student's distribution of the logarithm of the residuals'
             ratio, by the blocks. A hundredth is usual where a name has consequences.
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
             law, a better formula or a linear correction. The best of some hundred useless starts

@@ -1,7 +1,10 @@
 """How much better data that were left out of a fit are described with a law than without it.
 
-Reference: Stone, Cross-validatory choice and assessment of statistical predictions, J. R. Stat.
-Soc. B 36 (1974).
+References:
+    Stone, Cross-validatory choice and assessment of statistical predictions, J. R. Stat. Soc. B 36
+    (1974).
+    Miller, Simultaneous Statistical Inference (1981), 1.2, Bonferroni's bound: the best of many
+    laws gains by chance what one of them would at the level over their number.
 """
 
 from collections.abc import Sequence
@@ -12,6 +15,7 @@ from rig.diagnosis.outcome import Estimate, LikelihoodGain
 from rig.diagnosis.problem.problem import StrutEffect
 from rig.diagnosis.search.fit import model_for
 from rig.diagnosis.search.pool import Pool, ValidatedModel, error_ratio
+from rig.diagnosis.search.screen import candidate_laws
 
 
 class LeftOutGains(NamedTuple):
@@ -19,6 +23,12 @@ class LeftOutGains(NamedTuple):
 
     without: LikelihoodGain
     rival: LikelihoodGain | None
+
+    @property
+    def is_by_chance(self) -> bool:
+        """Whether chance gains as much, at the level of the criteria."""
+        low = self.without.error_ratio.low
+        return low is None or low <= 1.0
 
 
 def weigh_laws(
@@ -55,9 +65,10 @@ def _weigh(
     if rival is not None:
         pool.converge(rival, chosen)
         rival = _nearest_rival(pool, chosen, law)
+    least, level = min(subsets, key=lambda model: model.cost), pool.criteria.level
     return LeftOutGains(
-        _gain(pool, chosen, min(subsets, key=lambda model: model.cost)),
-        None if rival is None else _gain(pool, chosen, rival),
+        _gain(chosen, least, level / len(candidate_laws(pool.problem))),
+        None if rival is None else _gain(chosen, rival, level),
     )
 
 
@@ -79,10 +90,10 @@ def _family(law: StrutEffect) -> StrutEffect:
     return law[0], effect(law[1]).family
 
 
-def _gain(pool: Pool, chosen: ValidatedModel, other: ValidatedModel) -> LikelihoodGain:
-    level = max(1.0, chosen.cost / chosen.fit.rows)
+def _gain(chosen: ValidatedModel, other: ValidatedModel, level: float) -> LikelihoodGain:
+    variance = max(1.0, chosen.cost / chosen.fit.rows)
     return LikelihoodGain(
         tuple(name for _, name in other.fit.candidate.new),
-        0.5 * (other.cost - chosen.cost) / level,
-        Estimate(*error_ratio(other, chosen, pool.criteria.level)),
+        0.5 * (other.cost - chosen.cost) / variance,
+        Estimate(*error_ratio(other, chosen, level)),
     )

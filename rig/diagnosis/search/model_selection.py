@@ -37,6 +37,7 @@ _GENERAL = 2
 """Laws of a family that are tried for a simpler one, best along the motion first."""
 _MORE_FITS, _STILL_FALLING = 3, 0.95
 """Fits of a simpler model in addition, as long as each reduces its cost by a twentieth."""
+_BY_CHANCE = "chance gains as much on blocks left out of the fit, at a level of {:g}"
 _ALIKE = 0.01
 """Difference of two shares up to which they count as one, however narrow their intervals."""
 
@@ -101,6 +102,10 @@ def select_model(
             _attempt_plainer(pool, chosen)
             continue
         evidence = weigh_laws(pool, first, single, chosen)
+        if any(gains.is_by_chance for gains in evidence.values()):
+            pool.reject(chosen.fit.candidate, _BY_CHANCE.format(pool.criteria.level))
+            most_laws = chosen.size - 1
+            continue
         # A rival that was fitted until converged may be the better model.
         if is_repeated or pool.chosen(most_laws).fit.candidate == best.fit.candidate:
             break

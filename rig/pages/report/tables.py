@@ -154,7 +154,7 @@ def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
             f"{overlap}"
         )
         if item.evidence is not None:
-            note += f". {evidence_words(item.evidence)}"
+            note += f". {evidence_words(item.evidence, diagnosis.level)}"
         if item.where is not None:
             note += f". {acting_words(item.where)}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))

@@ -221,13 +221,14 @@ def _effect(item: FoundEffect, struts: int) -> str:
     return f"{law.words}{_where(item.strut, struts)}{described}{doubt}"
 
 
-def evidence_words(evidence: Evidence) -> str:
+def evidence_words(evidence: Evidence, level: float) -> str:
     """How much an effect gains on data left out of fits, and what held-out data say of it."""
     error = "the error on blocks left out of the fit is"
     text = f"Without it {error} {_gain(evidence.without)}"
     if evidence.rival is not None:
         laws = join_words([effect(name).words for name in evidence.rival.over], "and")
         text += f"; with the nearest other explanation ({laws}) it is {_gain(evidence.rival)}"
+    text += f" (ranges at a level of {100.0 * level:g}\u00a0%)"
     return f"{text}. {capital(CONFIRMATIONS[evidence.held_out])}"
 
 
