@@ -8,6 +8,7 @@ from pathlib import Path
 
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, dump_model, files_of
+from rig.diagnosis.determinable import find_determinable
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import (
     CORRECTED_FILE,
@@ -47,8 +48,11 @@ def diagnose_runs(
     names = [strut.name for strut in model.struts]
     recordings = [read_recording(path, names) for path in paths]
     learnt, evaluated = recordings[: len(runs)], recordings[len(runs) :]
+    progress("checking what the recordings determine", 0.0)
+    determinable = find_determinable(model, learnt)
     result = replace(
         diagnose(model, learnt, evaluated, progress, criteria),
+        determinable=determinable,
         sources=(
             DiagnosisSource(
                 "nominal model", model.name, sha256(dump_model(model).encode()).hexdigest()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from can_dbc.atomic_file import write_durably
 from dart_model.spec import ModelSpec, copy_files, dump_model
+from rig.diagnosis.recording_bounds import Determinable
 from rig.files.json_text import json_text
 
 Array = NDArray[np.float64]
@@ -426,13 +427,22 @@ class DiagnosisSource:
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a diagnosis; `fitted` are residual forces along the recordings learnt from."""
+    """The result of a diagnosis.
+
+    Attributes:
+        corrected: The corrected model.
+        fitted: Residual forces along the recordings learnt from.
+        held_out: Heights or forces along the recordings evaluated on.
+        sources: Files of model and recordings.
+        determinable: What the recordings learnt from can determine; None where it was not asked.
+    """
 
     diagnosis: Diagnosis
     corrected: ModelSpec
     fitted: tuple[FittedSeries, ...]
     held_out: tuple[HeldOutSeries, ...]
     sources: tuple[DiagnosisSource, ...] = ()
+    determinable: Determinable | None = None
 
 
 def to_json(diagnosis: Diagnosis) -> str:

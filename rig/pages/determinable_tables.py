@@ -3,7 +3,7 @@
 import math
 
 from dart_model.effects import FAMILY_WORDS
-from rig.diagnosis.determinable import Determinable, FamilyBound, LinearBound, RecordingFacts
+from rig.diagnosis.recording_bounds import Determinable, FamilyBound, LinearBound, RecordingFacts
 from rig.pages.number_formats import capital, number, percent, quantity, share
 from rig.pages.report.words import LINEAR
 

@@ -14,6 +14,7 @@ from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.outcome import (
+    ActingRange,
     DamperForce,
     Diagnosis,
     Estimate,
@@ -31,10 +32,16 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
+from rig.diagnosis.recording_bounds import (
+    Determinable,
+    FamilyBound,
+    LinearBound,
+    RecordingFacts,
+)
 from rig.pages.number_formats import label, quantity, value_and_interval
 from rig.pages.report import page, sentence, write_report
 from rig.pages.report.series import cloud, envelope, spectrum, surface
-from rig.pages.report.words import BLOCKS
+from rig.pages.report.words import BLOCKS, acting_words
 
 FRICTION = FoundEffect(
     "friction",
@@ -585,3 +592,42 @@ def test_a_surface_is_empty_where_there_are_too_few_samples() -> None:
     # Friction pulls together while the bodies part.
     rising = found_surface.velocity_m_per_s > 0.1
     assert np.nanmax(found_surface.before_n[rising]) < -10.0
+
+
+STOP = ActingRange(((0.35, 0.358),), ((-0.41, 0.41),), (0.35, 0.45), (-0.41, 0.41))
+
+
+def test_a_bar_and_a_sentence_show_where_an_effect_acts():
+    result = report(found(effects=(replace(FRICTION, where=STOP),)))
+    assert (
+        "It shows at heights from 350 mm to 358 mm (recorded from 350 mm to 450 mm), and at all "
+        "recorded velocities (from −0.410 m/s to 0.410 m/s)"
+    ) in shown(result)
+    # Friction steps with the velocity, which is the abscissa.
+    assert '"acting": [[-0.41, 0.41]]' in page(result)
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ((), "at no part of the recorded heights by itself"),
+        (((0.35, 0.36), (0.44, 0.45)), "from 350 mm to 360 mm and from 440 mm to 450 mm"),
+    ],
+)
+def test_parts_of_the_stroke_are_named(parts, words):
+    assert words in " ".join(acting_words(replace(STOP, height_m=parts)).split())
+
+
+def test_what_the_recordings_determine_is_a_section():
+    facts = RecordingFacts(
+        "sweep.csv", "strut", 3.0, 1000.0, 0.0, 0.0, 0.35, 0.45, 0.3, 0.3, 0.5, (1.0, 9.0), 1e-5,
+        None,
+    )  # fmt: skip
+    friction = FamilyBound("friction", "strut", 0.2, 0.01, "hysteresis", 4.5, "slow strokes")
+    mass = LinearBound("strut", "mass_kg", 10.0, 0.02, 0.5, None)
+    bounds = Determinable((facts,), (mass,), (friction,), ("fade",))
+    text = shown(report(determinable=bounds))
+    assert "What these recordings can determine" in text
+    assert "Friction 0.200 N 1.0 % hysteresis 4.50 N" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert "Fade of the damper: no law acts on these recordings." in text
+    assert "What these recordings can determine" not in shown(report())

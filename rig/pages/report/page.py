@@ -9,6 +9,7 @@ from dart_model.effects import FAMILY_WORDS, effect
 from dart_model.spec import dump_model
 from rig.diagnosis.outcome import Diagnosis, FittedSeries, Result
 from rig.machine.installed_versions import version_of
+from rig.pages import determinable_tables
 from rig.pages.html import render_report, write_page
 from rig.pages.identity import identity_rows
 from rig.pages.number_formats import capital, percent
@@ -100,6 +101,7 @@ def page(result: Result, labels: Mapping[str, str] | None = None) -> str:
         struts=struts,
         is_corrected=_has_corrections(diagnosis),
         tables=tables,
+        bounds=_bounds(result),
         capital=capital,
         found=find(result),
         finding_plot=_finding_plot(result),
@@ -145,6 +147,19 @@ def _finding_plot(result: Result) -> Plot | None:
         caption=f"{drawn.caption} The correction is that of the law named first; {rivals} "
         "describes these recordings as well."
     )
+
+
+def _bounds(result: Result) -> dict[str, object]:
+    """What the recordings can determine, as tables of texts; empty where it was not asked."""
+    found = result.determinable
+    if found is None:
+        return {}
+    return {
+        "warnings": determinable_tables.warnings(found),
+        "recordings": determinable_tables.recordings(found),
+        "linear": determinable_tables.linear(found),
+        "families": determinable_tables.families(found),
+    }
 
 
 def _corrected_text(result: Result) -> str:
