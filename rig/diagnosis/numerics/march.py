@@ -748,8 +748,7 @@ def _accelerate_tangents(
 def _step_tangents(
     model: Model, sizes: Integers, calls: _Calls, slopes: _SlopeCalls, scenario: Scenario,
     directions: Directions, by: ByLinearPart, span: _Span, part: tuple[float, float],
-    stages: _Stages,
-    work: _Work, tangent: _TangentWork,
+    stages: _Stages, work: _Work, tangent: _TangentWork,
 ) -> None:  # fmt: skip
     """Move the derivatives of the state over a part of a step: where it begins, and its length."""
     tabulated = model.equations.jacobian.shape[0] > 1
