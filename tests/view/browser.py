@@ -39,7 +39,7 @@ def page(made, server, width=1400, height=900, scheme="light", path=""):
     opened.goto(server.address + path)
     try:
         yield opened
-        assert errors == []
+        assert errors == [], errors
     finally:
         opened.close()
 
