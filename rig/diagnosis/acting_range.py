@@ -10,7 +10,6 @@ from rig.diagnosis.outcome import ActingRange, Interval
 from rig.diagnosis.problem.problem import rms
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _BINS = 40
 """Parts of the recorded range, of equal width: an end is known to a fortieth of it."""

@@ -282,6 +282,14 @@ def _cubic(rise: float, early: float, late: float, share: float) -> float:
 
 
 @inline
+def _cubic_rate(rise: float, early: float, late: float, share: float) -> float:
+    """Derivative of that change by the share."""
+    turn = early + late - 2.0 * rise
+    sag = 3.0 * rise - 2.0 * early - late
+    return early + share * (2.0 * sag + 3.0 * share * turn)
+
+
+@inline
 def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
     """Write the reference coordinates and their rates, between nodes."""
     # Hermite's cubic: a chord would cut the motion's bends.
@@ -293,10 +301,7 @@ def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
         work.q[j] = q[a, j] + _cubic(rise, early, late, at.share)
         work.v[j] = v[a, j]
         if at.gap_s > 0.0:
-            turn = early + late - 2.0 * rise
-            sag = 3.0 * rise - 2.0 * early - late
-            rate = early + at.share * (2.0 * sag + 3.0 * at.share * turn)
-            work.v[j] = rate / at.gap_s
+            work.v[j] = _cubic_rate(rise, early, late, at.share) / at.gap_s
 
 
 @inline
@@ -817,10 +822,7 @@ def _record_tangents(
                 late = gap * tangent.rates[1, i, d]
                 out.heights[within, i, d] = begin + _cubic(rise, early, late, share)
                 if out.velocities.shape[0] > 0:
-                    turn = early + late - 2.0 * rise
-                    sag = 3.0 * rise - 2.0 * early - late
-                    rate = early + share * (2.0 * sag + 3.0 * share * turn)
-                    out.velocities[within, i, d] = rate / gap
+                    out.velocities[within, i, d] = _cubic_rate(rise, early, late, share) / gap
 
 
 @inline

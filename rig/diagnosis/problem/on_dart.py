@@ -136,6 +136,6 @@ def _interpolate_inputs(run: DrivenRun, steps: Integers) -> Array:
     nodes = np.arange(len(steps) - 1)
     first = np.cumsum(steps) - steps
     within = np.arange(first[-1]) - np.repeat(first[:-1], steps[:-1])
-    wanted = np.repeat(nodes, steps[:-1]) + within / np.repeat(steps[:-1], steps[:-1])
+    points = np.repeat(nodes, steps[:-1]) + within / np.repeat(steps[:-1], steps[:-1])
     at = np.linspace(0.0, len(nodes), len(run.fine))
-    return CubicSpline(at, run.fine)(np.append(wanted, len(nodes)))
+    return CubicSpline(at, run.fine)(np.append(points, len(nodes)))

@@ -144,7 +144,6 @@ const Charts = (() => {
       ctx.fillStyle = colour("--band");
       ctx.fillRect(left, upper, wide, lower - upper);
     }
-    ctx.fillStyle = ctx.strokeStyle = colour("--axis");
     // Where an effect acts, as a bar along the abscissa.
     for (const [first, last] of spec.acting ?? []) {
       const [x, end] = [first, last].map((v) => Math.min(Math.max(u.valToPos(v, "x", true), left), left + wide));
@@ -152,7 +151,7 @@ const Charts = (() => {
       ctx.fillStyle = colour("--law");
       ctx.fillRect(x, top + high - thick, end - x, thick);
     }
-    ctx.fillStyle = colour("--axis");
+    ctx.fillStyle = ctx.strokeStyle = colour("--axis");
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
     for (const mark of spec.marks ?? []) {
       const [x, end] = [mark.begin, mark.end].map((v) => u.valToPos(v, "x", true));
