@@ -22,7 +22,7 @@ from rig.diagnosis.problem.problem import (
     nominal,
     quadratic_mean,
 )
-from rig.diagnosis.progress import Progress, within
+from rig.diagnosis.progress import Progress, no_progress, within
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.explore import FirstRound, explore
 from rig.diagnosis.search.fit import WITH_MEMORY, Fit, fit
@@ -57,10 +57,6 @@ class _Found(NamedTuple):
     evaluations: tuple[RunEvaluation, ...]
     laws: HeldOutLaws
     verdict: Verdict
-
-
-def no_progress(_what: str, _share: float) -> None:
-    """A progress callback that does nothing."""
 
 
 @with_one_blas_thread

@@ -13,3 +13,7 @@ def within(progress: Progress, first: float, last: float, of: str = "") -> Progr
         progress(f"{of}: {what}" if of else what, first + (last - first) * share)
 
     return part
+
+
+def no_progress(_what: str, _share: float) -> None:
+    """A progress callback that does nothing."""

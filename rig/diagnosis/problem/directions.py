@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.diagnosis.numerics.march import ByLinearPart, Directions
+from rig.diagnosis.numerics.march import ByLinearPart, Directions, Model, Scenario, Steps
 from rig.diagnosis.problem.driven_run import DrivenRun
+from rig.diagnosis.problem.grid import fine_times
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 from rig.diagnosis.problem.problem import LinearParameter
 
@@ -78,3 +79,35 @@ def by_linear_part(
         np.ascontiguousarray(by_kg),
         np.ascontiguousarray(gains),
     )
+
+
+def pushed_by(
+    forces: Sequence[tuple[int, Array]], model: Model, scenario: Scenario, steps: Steps
+) -> tuple[Model, Scenario, Steps, Directions, ByLinearPart]:
+    """A simulation differentiated by the gains of forces, each (N,) in a strut given by its index.
+
+    They are further inputs, which do not push the model itself.
+    """
+    equations, count = model.equations, len(forces)
+    points, n, before = equations.inputs.shape
+    struts = equations.jacobian.shape[1]
+    times = fine_times(scenario.t_s[scenario.strides], 2 * steps.substeps)
+    fine = [np.interp(times, scenario.t_s, force_n) for _, force_n in forces]
+    gains = np.zeros((points, n, before + count))
+    gains[:, :, before:] = np.swapaxes(equations.jacobian[:, [at for at, _ in forces]], 1, 2)
+    none = np.full(max(struts, len(model.parameters)), -1)
+    gain = np.concatenate([np.full(before, -1), np.arange(count)])
+    return (
+        model._replace(equations=equations._replace(inputs=_with_more(equations.inputs, count))),
+        scenario._replace(inputs=np.column_stack([scenario.inputs, *fine])),
+        steps,
+        Directions(count, none, none, none, none, none, gain, none, -1),
+        ByLinearPart(
+            np.zeros(0), np.zeros((0, 0, n, n)), np.zeros((0, 0, n)), np.zeros((0, 0, n, 0)), gains
+        ),
+    )
+
+
+def _with_more(inputs: Array, count: int) -> Array:
+    """Generalised forces per unit of inputs, and of further ones that do nothing."""
+    return np.concatenate([inputs, np.zeros((*inputs.shape[:2], count))], axis=2)

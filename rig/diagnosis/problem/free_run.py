@@ -7,7 +7,7 @@ as it is: an equation error that passes through the model's own dynamics has the
 error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -43,7 +43,7 @@ from rig.diagnosis.problem.channel_delays import (
     known_share,
     late_columns,
 )
-from rig.diagnosis.problem.directions import by_linear_part, directions_of
+from rig.diagnosis.problem.directions import by_linear_part, directions_of, pushed_by
 from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
 from rig.diagnosis.problem.driven_run import DrivenRun, driven_run, first_motion, track_of
 from rig.diagnosis.problem.grid import (
@@ -69,6 +69,7 @@ from rig.diagnosis.problem.problem import (
     ResidualForces,
     RunEvaluation,
     Segment,
+    StrutEffect,
     first_starts,
     mid_stroke_m,
     nominal,
@@ -393,24 +394,57 @@ class FreeRunProblem(Problem):
             return None
         if not all(np.all(np.isfinite(part)) for part in tangents):
             return None
-        weight = self._gains(model) / self.noise_m
-        if late:
-            weight = weight * known_share(run.grid.t_s, delays_s)[run.grid.fitted]
         columns = np.empty((int(run.grid.fitted.sum()) * len(self.noise_m), int(varied.sum())))
+        whitened = self._whiten_tangents(k, model, tangents)
         for i, column in enumerate(np.flatnonzero(varied).tolist()):
             if column in simulated:
-                d = simulated[column]
-                heights = np.ascontiguousarray(tangents.heights[:, :, d])
-                if late:
-                    rates = np.ascontiguousarray(tangents.velocities[:, :, d])
-                    heights = late_columns(run.grid.t_s, heights, rates, delays_s)
-                columns[:, i] = -(heights[run.grid.fitted] * weight).ravel()
+                columns[:, i] = whitened(simulated[column])
             else:
                 changed = self._difference(k, model, motion, column)
                 if changed is None:
                     return None
                 columns[:, i] = changed
         return columns
+
+    def _whiten_tangents(
+        self, k: int, model: CandidateModel, tangents: Tangents
+    ) -> Callable[[int], Array]:
+        """Derivative of the residual, shape (m,), of a column of a motion's derivatives."""
+        grid, delays_s = self.runs[k].grid, self._delays(model).struts
+        weight = self._gains(model) / self.noise_m
+        late = bool(np.any(delays_s))
+        if late:
+            weight = weight * known_share(grid.t_s, delays_s)[grid.fitted]
+
+        def whiten(column: int) -> Array:
+            heights = np.ascontiguousarray(tangents.heights[:, :, column])
+            if late:
+                rates = np.ascontiguousarray(tangents.velocities[:, :, column])
+                heights = late_columns(grid.t_s, heights, rates, delays_s)
+            return -(heights[grid.fitted] * weight).ravel()
+
+        return whiten
+
+    def law_responses(
+        self, k: int, model: CandidateModel, laws: Sequence[tuple[StrutEffect, Array]]
+    ) -> Array | None:
+        """Responses to the laws' forces along the model's free run, which march along with it."""
+        run, start = self._in_fits(k, model), model.parts.starts[k]
+        prepared, motion = self._prepare(run, model, start), self.simulate(run, model, start)
+        if prepared is None or motion is None:
+            return None
+        along = track_of(motion, self._before_delays(k, model))
+        constants = strut_constants(self, model.parts.linear)
+        forces = [track.finite_law_force(along, *law, constants) for law in laws]
+        shape = (*motion.heights_m.shape, len(laws))
+        late = bool(np.any(self._delays(model).struts))
+        tangents = Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
+        pushed = pushed_by([(at[0], n) for (at, _), n in zip(laws, forces, strict=True)], *prepared)
+        slots = slots_of(self, model.candidate)
+        if not differentiate(slots, *pushed, self._empty_motion(run), tangents):
+            return None
+        whitened = self._whiten_tangents(k, model, tangents)
+        return np.column_stack([whitened(column) for column in range(len(laws))])
 
     def _difference(
         self, k: int, model: CandidateModel, motion: Trajectory, parameter: int

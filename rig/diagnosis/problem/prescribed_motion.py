@@ -38,12 +38,14 @@ from rig.diagnosis.problem.problem import (
     ResidualForces,
     RunEvaluation,
     Segment,
+    StrutEffect,
     nominal,
     nominal_model,
     rms,
     rms_about_mean,
     select_nodes,
     state_scales,
+    strut_constants,
     strut_effects,
 )
 from rig.recordings.recording import RecordingError
@@ -262,6 +264,19 @@ class PrescribedProblem(Problem):
 
     def _whiten(self, forces: Array, rows: Integers) -> Array:
         return (forces[np.ix_(self._cell_struts, rows)].T / self.noise_n[self._cell_struts]).ravel()
+
+    def law_responses(
+        self, k: int, model: CandidateModel, laws: Sequence[tuple[StrutEffect, Array]]
+    ) -> Array:
+        along, rows = self.runs[k].seen(delays_s := self._delays_s(model)), self._rows(k)
+        constants = strut_constants(self, model.parts.linear)
+        shares = known_share(along.t_s, delays_s).T
+        columns: list[Array] = []
+        for at, values in laws:
+            forces = np.zeros((len(self.noise_n), len(along.t_s)))
+            forces[at[0]] = track.finite_law_force(along, at, values, constants)
+            columns.append(-self._whiten(shares * forces, rows))
+        return np.column_stack(columns)
 
     def floor_level(self, model: CandidateModel) -> float:
         """One: noise of the motion is in what whitens the residual."""

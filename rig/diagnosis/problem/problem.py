@@ -270,6 +270,16 @@ class Problem(ABC):
         return None
 
     @abstractmethod
+    def law_responses(
+        self, k: int, model: CandidateModel, laws: Sequence[tuple[StrutEffect, Array]]
+    ) -> Array | None:
+        """Derivative of a recording's residual by shares of further laws, shape (m, laws).
+
+        Each law, with its parameters, acts along the model's own motion. None where the model runs
+        away; zero for a law that is not finite there.
+        """
+
+    @abstractmethod
     def floor_level(self, model: CandidateModel) -> float:
         """Mean square of a right model's residual: noise of the sensors and the applied force."""
 

@@ -14,6 +14,7 @@ from rig.diagnosis.problem.problem import (
     ExistingParameters,
     Problem,
     Segment,
+    StrutEffect,
     slots_of,
     strut_constants,
     strut_effects,
@@ -76,6 +77,14 @@ def law_force(
     step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
     substeps = int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
     return force_along(name, own, motion, substeps)
+
+
+def finite_law_force(
+    track: Track, strut_effect: StrutEffect, values: Array, constants: Array
+) -> Array:
+    """The same of a law in its strut, from rest; zero (N,) where any of it is not finite."""
+    force = law_force(track, *strut_effect, values, constants)
+    return force if np.all(np.isfinite(force)) else np.zeros_like(force)
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:

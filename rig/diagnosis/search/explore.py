@@ -98,7 +98,8 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
             break
         chosen = _choose_for_fitting(pool, level) + _remove_laws(pool, levels, level[:2])
         levels.append(level)
-        _fit_all(pool, stage, pool.linear, chosen, within(progress, 0.5 * (begin + end), end))
+        part = within(progress, 0.5 * (begin + end), end)
+        pool.attempt_screenings(stage, pool.linear, chosen, part)
         # One law may imitate two. The search beyond a pair is about it, not the linear model.
         if pool.at_floor(pool.converge_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
@@ -195,7 +196,8 @@ def _expand_along_motion(pool: Pool, reference: ValidatedModel, progress: Progre
     stage = stage_of(pool.problem, reference.fit.model)
     rounds = _screen_rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
     level = [s for s in _refine_best_of_each(rounds) if s.laws != reference.fit.candidate.new]
-    _fit_all(pool, stage, reference, _choose_for_fitting(pool, level), within(progress, 0.5, 1.0))
+    chosen = _choose_for_fitting(pool, level)
+    pool.attempt_screenings(stage, reference, chosen, within(progress, 0.5, 1.0))
 
 
 def _expand_in_simulation(
@@ -218,9 +220,8 @@ def _expand_in_simulation(
         for change in pool.changes(model)
         if change.cost < min(least, known.get(change.model.candidate, least))
     ]
-    for change in _diverse(changes, pool.criteria.fitted_a_size):
-        progress(f"fitting {', '.join(name for _, name in change.laws)}", 0.5)
-        pool.attempt(change.model)
+    chosen = _diverse(changes, pool.criteria.fitted_a_size)
+    pool.attempt_all([change.model for change in chosen], progress=within(progress, 0.5, 1.0))
 
 
 def _screen_rounds(
@@ -261,18 +262,6 @@ def _remove_laws(
             if screening is not None and screening.validation_cost <= least:
                 smaller.append(screening)
     return smaller
-
-
-def _fit_all(
-    pool: Pool,
-    stage: Stage,
-    reference: ValidatedModel,
-    screenings: Sequence[Screening],
-    progress: Progress,
-) -> None:
-    for i, screening in enumerate(screenings):
-        progress(f"fitting {', '.join(name for _, name in screening.laws)}", i / len(screenings))
-        pool.attempt_screening(stage, reference, screening)
 
 
 def _choose_for_fitting(pool: Pool, level: Sequence[Screening]) -> list[Screening]:

@@ -337,7 +337,7 @@ def _superfluous_effects(pool: Pool, chosen: ValidatedModel) -> tuple[int, ...]:
             continue
         kept = tuple(j for j in reference.candidate.kept if j != i)
         candidate = Candidate(kept, reference.candidate.new)
-        result = pool.refit(model_for(problem, reference.model, candidate), FULL)
+        result = pool.refit(model_for(problem, reference.model, candidate), effort=FULL)
         if result is not None and not pool.prefers(chosen, pool.validate(result)):
             superfluous.append(i)
     return tuple(superfluous)

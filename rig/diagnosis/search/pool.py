@@ -6,8 +6,10 @@ one-standard-error rule.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from os import cpu_count
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +28,10 @@ from rig.diagnosis.problem.problem import (
     first_starts,
     free_linear,
     nominal,
+    slots_of,
 )
 from rig.diagnosis.problem.track import forces_along
+from rig.diagnosis.progress import Progress, no_progress
 from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit, validation_costs
 from rig.diagnosis.search.score_test import ModelChange, find_changes
@@ -89,6 +93,17 @@ class ValidatedModel(NamedTuple):
         return tuple(sorted(effect(name).family for _, name in self.fit.candidate.new))
 
 
+class Begin(NamedTuple):
+    """Where a fit begins.
+
+    Attributes:
+        most_level: As of `rig.diagnosis.search.fit.fit`.
+    """
+
+    model: CandidateModel
+    most_level: float = np.inf
+
+
 class Pool:
     """Fitted models by candidate; of two fits of one candidate the better is kept.
 
@@ -107,8 +122,7 @@ class Pool:
         self.converged: set[Candidate] = set()
         self.floors: dict[Candidate, tuple[ValidatedModel, float]] = {}
         self.tested: dict[Candidate, tuple[ValidatedModel, tuple[ModelChange, ...]]] = {}
-        for seed in seeds:
-            self.attempt(seed.model)
+        self.attempt_all([seed.model for seed in seeds])
         base = nominal(problem)
         self.linear = self.fits.setdefault(base, self.validate(given))
 
@@ -128,7 +142,7 @@ class Pool:
         return ValidatedModel(result, validation_costs(self.problem, result))
 
     def refit(
-        self, model: CandidateModel, effort: Effort, most_level: float = np.inf
+        self, model: CandidateModel, most_level: float = np.inf, *, effort: Effort
     ) -> Fit | None:
         """Fit a model with all linear parameters that may be fitted together with its laws."""
         candidate, parts = model
@@ -137,23 +151,55 @@ class Pool:
         first = CandidateModel(candidate, parts)
         return fit(self.problem, first, free, effort, most_level=most_level)
 
-    def attempt(
-        self, model: CandidateModel, effort: Effort = ROUGH, most_level: float = np.inf
-    ) -> None:
+    def attempt(self, model: CandidateModel, effort: Effort = ROUGH) -> None:
         """Fit a model in simulation and keep the better of this and an earlier fit."""
-        candidate = model.candidate
-        result = self.refit(model, effort, most_level)
-        if effort is FULL:
-            self.converged.add(candidate)
-        if result is None:
+        self.attempt_all([model], effort)
+
+    def attempt_all(
+        self,
+        models: Sequence[CandidateModel],
+        effort: Effort = ROUGH,
+        progress: Progress = no_progress,
+    ) -> None:
+        """Fit models in simulation, as `attempt` does, some at a time."""
+        jobs = [(model.candidate, partial(Begin, model)) for model in models]
+        self._fit_each(jobs, effort, progress)
+
+    def _fit_each(
+        self,
+        jobs: Sequence[tuple[Candidate, Callable[[], Begin]]],
+        effort: Effort,
+        progress: Progress,
+    ) -> None:
+        """Fit candidates from where they begin, and keep each that is better than an earlier fit.
+
+        Begins and fits are independent of each other, and take a thread each.
+        """
+        for candidate, _ in jobs:
+            slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
+
+        def fit_one(begin: Callable[[], Begin]) -> ValidatedModel | None:
+            result = self.refit(*begin(), effort=effort)
+            return None if result is None else self.validate(result)
+
+        with ThreadPoolExecutor(cpu_count()) as threads:
+            results = threads.map(fit_one, [begin for _, begin in jobs])
+            for i, (candidate, _) in enumerate(jobs):
+                names = ", ".join(name for _, name in candidate.new) or "the linear part"
+                progress(f"fitting {names}", i / len(jobs))
+                model = next(results)
+                if effort is FULL:
+                    self.converged.add(candidate)
+                if model is not None:
+                    self._keep(candidate, model)
+
+    def _keep(self, candidate: Candidate, model: ValidatedModel) -> None:
+        if candidate in self.fits and model.cost >= self.fits[candidate].cost:
             return
-        validated = self.validate(result)
-        if candidate in self.fits and validated.cost >= self.fits[candidate].cost:
-            return
-        self.fits[candidate] = validated
+        self.fits[candidate] = model
         self.invalid.pop(candidate, None)
-        linear = self.fits.get(nominal(self.problem), validated).fit.parts.linear
-        why = find_defect(self.problem, result, linear, self.along, self.criteria)
+        linear = self.fits.get(nominal(self.problem), model).fit.parts.linear
+        why = find_defect(self.problem, model.fit, linear, self.along, self.criteria)
         if why is not None:
             self.invalid[candidate] = why
 
@@ -161,6 +207,26 @@ class Pool:
         self, stage: Stage, reference: ValidatedModel, screening: Screening, effort: Effort = ROUGH
     ) -> None:
         """Fit a screening's laws in simulation, from their parameters along the motion."""
+        self.attempt_screenings(stage, reference, [screening], no_progress, effort)
+
+    def attempt_screenings(
+        self,
+        stage: Stage,
+        reference: ValidatedModel,
+        screenings: Sequence[Screening],
+        progress: Progress,
+        effort: Effort = ROUGH,
+    ) -> None:
+        """Fit the laws of screenings, as `attempt_screening` does, some at a time."""
+        base = nominal(self.problem)
+        jobs = [
+            (base.with_effects(*it.laws), partial(self._begin_at, stage, reference, it))
+            for it in screenings
+        ]
+        self._fit_each(jobs, effort, progress)
+
+    def _begin_at(self, stage: Stage, reference: ValidatedModel, screening: Screening) -> Begin:
+        """Where a fit of a screening's laws begins: at their parameters along the motion."""
         base, known = nominal(self.problem), reference.fit
         existing = existing_values(self.problem, base)
         if known.candidate.kept == base.kept:
@@ -179,7 +245,7 @@ class Pool:
         linear = np.clip(linear, least, most)
         model = self._fit_starts(candidate, linear, np.concatenate(values))
         # Priors weigh as in the regression: a free run may begin far off with right parameters.
-        self.attempt(model, effort, max(1.0, screening.cost / len(stage.target)))
+        return Begin(model, max(1.0, screening.cost / len(stage.target)))
 
     def _fit_starts(self, candidate: Candidate, linear: Array, effects: Array) -> CandidateModel:
         """A model with fitted initial states; those of a poorer model compensate its error."""
@@ -219,14 +285,19 @@ class Pool:
 
     def converge(self, model: ValidatedModel, best: ValidatedModel) -> None:
         """Fit a model until converged if it comes near the best one."""
-        if model.size and self.is_near(model, best) and model.fit.candidate not in self.converged:
+        if self._may_fall(model, best):
             self.attempt(model.fit.model, FULL)
+
+    def _may_fall(self, model: ValidatedModel, best: ValidatedModel) -> bool:
+        """Whether a model of laws that comes near the best one has not converged yet."""
+        return bool(
+            model.size and self.is_near(model, best) and model.fit.candidate not in self.converged
+        )
 
     def converge_best(self) -> None:
         """Fit the models that may be chosen until converged."""
         best = self.best()
-        for model in best:
-            self.converge(model, best[0])
+        self.attempt_all([m.fit.model for m in best if self._may_fall(m, best[0])], FULL)
 
     # --- what may be chosen -------------------------------------------------------------------
 

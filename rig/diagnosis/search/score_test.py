@@ -1,7 +1,7 @@
 """Score test of laws added to a fitted model, or in exchange for one of its laws.
 
 Where a strut sticks, a law along the smoothed motion errs by more than the missing force; the
-model's simulated response to a small share of the law does not. How much of the residual this
+derivative of the model's free run by the law's size does not. How much of the residual this
 response explains, all fitted variables remaining free, is the statistic of the score test.
 
 References:
@@ -13,6 +13,7 @@ References:
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 from os import cpu_count
 from typing import NamedTuple
 
@@ -37,8 +38,8 @@ from rig.diagnosis.search.screen import candidate_laws, is_compatible, law_start
 
 Array = NDArray[np.float64]
 
-_SMALL = 0.02
-"""Force of the law under test, as a share of the residual force of the linear model."""
+_TOGETHER = 16
+"""Laws whose responses march together: with more, they fill memory."""
 _MATCHING = Effort(10, sides=1)
 """Fits of a law to another one's force."""
 _TINY = 1e-100
@@ -109,9 +110,13 @@ def find_changes(
     for _, name in [*laws, *(at for at, _ in (*additions, *exchanges))]:
         compile_law(name)  # Compiled here: numba's compiler is not thread-safe.
     replaced = {at: _remove_law_force(base, at) for at in laws}
+    sized = [job for job in additions if effect(job[0][1]).scaled]
+    whole = [job for job in additions if not effect(job[0][1]).scaled]
+    batches = [sized[i : i + _TOGETHER] for i in range(0, len(sized), _TOGETHER)]
     with ThreadPoolExecutor(cpu_count()) as pool:
         tested = [
-            *pool.map(lambda job: _test_addition(base, *job), additions),
+            *chain.from_iterable(pool.map(lambda jobs: _test_sized(base, jobs), batches)),
+            *pool.map(lambda job: _test_addition(base, *job), whole),
             *pool.map(lambda job: _test_exchange(base, job[0], replaced[job[1]]), exchanges),
         ]
     best: dict[Candidate, ModelChange] = {}
@@ -151,24 +156,33 @@ def _exchanges(base: _Base) -> Iterator[tuple[StrutEffect, StrutEffect]]:
                 yield at, old
 
 
+def _test_sized(base: _Base, laws: Sequence[tuple[StrutEffect, Array]]) -> list[ModelChange | None]:
+    """Additions of laws that have a size, by the derivative of the residual by it."""
+    problem, model = base.problem, base.fit.model
+    parts = [problem.law_responses(k, model, laws) for k in range(problem.recordings)]
+    columns = [part for part in parts if part is not None]
+    if len(columns) < len(parts):
+        return []
+    responses = -np.concatenate(columns)
+    responses -= base.basis @ (base.basis.T @ responses)
+    tested: list[ModelChange | None] = []
+    for (at, start), column in zip(laws, responses.T, strict=True):
+        size = _best_size(base, column)
+        values = scale_law(at[1], start, size)
+        candidate = base.fit.candidate.with_effects(at)
+        if values is not None:
+            tested.append(_change(base, candidate, at, values, size * column))
+    return tested
+
+
 def _test_addition(base: _Base, at: StrutEffect, start: Array) -> ModelChange | None:
-    item, share, small = effect(at[1]), 1.0, start.copy()
-    if item.scaled:
-        mean_square = float(np.mean(_forces(base, at, start) ** 2))
-        if not 0.0 < mean_square < np.inf:
-            return None
-        share = _SMALL * base.problem.motions[at[0]].force_n / np.sqrt(mean_square)
-        small[list(item.scaled)] *= share
+    """Addition of a law without a size, by the response to all of it."""
     candidate = base.fit.candidate.with_effects(at)
-    column = _response(base, candidate, at, small)
+    column = _response(base, candidate, at, start)
     if column is None:
         return None
-    column = column / share
-    size = _best_size(base, column)
-    if not item.scaled:
-        size = float(np.clip(size, 0.0, 1.0))
-    values = scale_law(at[1], start, size)
-    return None if values is None else _change(base, candidate, at, values, size * column)
+    size = float(np.clip(_best_size(base, column), 0.0, 1.0))
+    return _change(base, candidate, at, start, size * column)
 
 
 def _remove_law_force(base: _Base, at: StrutEffect) -> _ReplacedLaw:
