@@ -18,6 +18,8 @@ _MOST_STEPS = 32
 """Steps of DART between two nodes from which on no more are tried."""
 _MOST_STEPS_IN_ALL = 1_500_000
 """Steps of DART that take some ten seconds."""
+_OF_A_MOTION = 3
+"""Inputs of a motion: position, velocity, acceleration."""
 
 
 def spec_with_corrections(problem: Problem, model: CandidateModel) -> ModelSpec:
@@ -112,10 +114,9 @@ def _simulate_heights(
     states, start = begin
     grid = run.grid
     count = len(grid.t_s)
-    n, inputs = plant.free_coordinates, _interpolate_inputs(run, steps)
+    n, (begins, ends) = plant.free_coordinates, (it.tolist() for it in _inputs_of_steps(run, steps))
     numbers = (*start[: 2 * n].tolist(), *states)
-    state = plant.state_of(numbers, float(grid.t_s[0]), inputs[0].tolist())
-    drive = inputs.tolist()
+    state = plant.state_of(numbers, float(grid.t_s[0]), begins[0])
     no_forces = (0.0,) * len(plant.spec.struts)
     heights = np.empty((count, len(no_forces)))
     lengths, step = (np.diff(grid.t_s) / steps[:-1]).tolist(), 0
@@ -125,17 +126,25 @@ def _simulate_heights(
         if k + 1 == count:
             break
         for _ in range(steps[k]):
-            loaded = plant.load(state, no_forces, drive[step], temperature[k])
+            loaded = plant.load(state, no_forces, begins[step], temperature[k])
+            state = plant.step(loaded, lengths[k], ends[step])
             step += 1
-            state = plant.step(loaded, lengths[k], drive[step])
     return heights
 
 
-def _interpolate_inputs(run: DrivenRun, steps: Integers) -> Array:
-    """Input vector at so many points from each node on, and at the last node."""
+def _inputs_of_steps(run: DrivenRun, steps: Integers) -> tuple[Array, Array]:
+    """Input vectors with which each step begins and ends, shape (all steps, inputs).
+
+    Within a step a force is a straight line: the one with the mean and the first moment of the
+    measured force, with which a step errs by its fourth order. The chord errs by its second.
+    """
     nodes = np.arange(len(steps) - 1)
-    first = np.cumsum(steps) - steps
+    first, count = np.cumsum(steps) - steps, np.repeat(steps[:-1], steps[:-1])
     within = np.arange(first[-1]) - np.repeat(first[:-1], steps[:-1])
-    points = np.repeat(nodes, steps[:-1]) + within / np.repeat(steps[:-1], steps[:-1])
-    at = np.linspace(0.0, len(nodes), len(run.fine))
-    return CubicSpline(at, run.fine)(np.append(points, len(nodes)))
+    points = np.repeat(nodes, steps[:-1]) + within / count
+    inputs = CubicSpline(np.linspace(0.0, len(nodes), len(run.fine)), run.fine)
+    begin, middle, end = (inputs(points + share / count) for share in (0.0, 0.5, 1.0))
+    lift = (2.0 * middle - begin - end) / 3.0
+    for motion in run.drive.moved:
+        lift[:, motion : motion + _OF_A_MOTION] = 0.0
+    return begin + lift, end + lift
