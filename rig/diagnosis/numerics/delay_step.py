@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 Array = NDArray[np.float64]
 
@@ -288,12 +289,13 @@ def _long_run_covariance(values: Array) -> Array:
     """Covariance of the sums of correlated series (N, k), Bartlett weights up to a tenth of N."""
     count = len(values)
     lags = max(1, count // 10)
-    spectrum = np.fft.rfft(values, 2 * count, axis=0)
+    size = next_fast_len(2 * count, real=True)
+    spectrum = np.fft.rfft(values, size, axis=0)
     weights = 1.0 - np.arange(lags + 1) / (lags + 1)
     covariance = np.empty((values.shape[1],) * 2)
     for i in range(values.shape[1]):
         for j in range(values.shape[1]):
-            products = np.fft.irfft(spectrum[:, i] * np.conj(spectrum[:, j]))
+            products = np.fft.irfft(spectrum[:, i] * np.conj(spectrum[:, j]), size)
             ahead, behind = products[: lags + 1], products[-lags:]
             covariance[i, j] = float(weights @ ahead + weights[1:] @ behind[::-1])
     return covariance

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
@@ -213,7 +214,7 @@ def _tones(t_s: Array, force: Array, least_hz: float) -> tuple[tuple[float, floa
     residual = force - force.mean()
     tones: list[tuple[float, float]] = []
     window = np.hanning(len(residual))
-    size = 4 * len(residual)
+    size = next_fast_len(4 * len(residual), real=True)
     for _ in range(2 * _TONES):
         spectrum = np.fft.rfft(residual * window, size)
         best = 4 + int(np.argmax(np.abs(spectrum[4:-4])))

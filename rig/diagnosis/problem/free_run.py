@@ -300,7 +300,7 @@ class FreeRunProblem(Problem):
         """A recording with its inputs as they were before their delays."""
         return self.runs[k].before_delays(self._delays(model).inputs)
 
-    def _in_fits(self, k: int, model: CandidateModel) -> DrivenRun:
+    def in_fits(self, k: int, model: CandidateModel) -> DrivenRun:
         """The same, as fits simulate it."""
         runs = self.runs if slots_of(self, model.candidate).states else self.in_strides or self.runs
         run = runs[k]
@@ -362,7 +362,7 @@ class FreeRunProblem(Problem):
 
     def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Measured less simulated heights over the noise, at the fitted nodes, flat."""
-        run = self._in_fits(k, model)
+        run = self.in_fits(k, model)
         motion = self.simulate(run, model, model.parts.starts[k])
         return None if motion is None else self._compare(k, model, motion)
 
@@ -379,7 +379,7 @@ class FreeRunProblem(Problem):
         return self._differentiate
 
     def _differentiate(self, k: int, model: CandidateModel, varied: Flags) -> Array | None:
-        run, parts = self._in_fits(k, model), model.parts
+        run, parts = self.in_fits(k, model), model.parts
         prepared = self._prepare(run, model, parts.starts[k])
         if prepared is None:
             return None
@@ -429,7 +429,7 @@ class FreeRunProblem(Problem):
         self, k: int, model: CandidateModel, laws: Sequence[tuple[StrutEffect, Array]]
     ) -> Array | None:
         """Responses to the laws' forces along the model's free run, which march along with it."""
-        run, start = self._in_fits(k, model), model.parts.starts[k]
+        run, start = self.in_fits(k, model), model.parts.starts[k]
         prepared, motion = self._prepare(run, model, start), self.simulate(run, model, start)
         if prepared is None or motion is None:
             return None
@@ -458,7 +458,7 @@ class FreeRunProblem(Problem):
         if self.linear[parameter].input < 0:
             ahead, behind = (self._compare(k, other, motion) for other in (more, less))
             return (ahead - behind) / (2.0 * step)
-        moved = self.simulate(self._in_fits(k, more), more, model.parts.starts[k])
+        moved = self.simulate(self.in_fits(k, more), more, model.parts.starts[k])
         if moved is None:
             return None
         return (self._compare(k, more, moved) - self._compare(k, model, motion)) / step
@@ -814,15 +814,17 @@ class FreeRunProblem(Problem):
             [estimate_noise(grid.t_s, c).variance for c in (grid.heights_m - seen_m[2]).T]
         )
         on_dart_m: list[Array] = []
+        coarser = self.coarser(models.linear)
         for model, motion, heights_m in (
             (models.nominal, before, seen_m[0]),
             (models.corrected, after, seen_m[2]),
         ):
             error_m = rms(measured - heights_m)
             tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
-            start, run = model.parts.starts[k], self._before_delays(k, model)
+            start, run = model.parts.starts[k], coarser.in_fits(k, model)
             # DART is compared with steps that err less: friction that is all but a sign needs them.
-            exact = self.simulate(run.finer(), model, start) or motion
+            finer = self._before_delays(k, model).finer()
+            exact = self.simulate(finer, model, start) or motion
             parts = self._parts(run, model, start)
             found_m = on_dart.dart_heights(
                 self, run, model, start, exact.heights_m, tolerance_m, parts

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dart_model.effects import effect
 from dart_model.plant import DartPlant
@@ -64,17 +64,16 @@ def dart_heights(
     tolerance_m: float,
     parts: Integers | None = None,
 ) -> Array:
-    """Heights of a model in free run in DART, shape (N, struts).
+    """Heights of a model in free run in DART, shape (N, struts); between strides by cubics.
 
     Its steps are refined until its heights differ from `expected_m`, those of the same model as the
     diagnosis simulates it, or from those with steps of twice the length, by less than `tolerance_m`
     RMS: where joints turn, a model that does not follow the bench moves otherwise in DART. They are
-    so many times shorter after each node as `parts` (N,) has it: where forces jump.
+    so many times shorter in each stride as `parts` (S + 1,) has it: where forces jump.
     """
     plant = DartPlant(spec_with_corrections(problem, model))
-    nodes = len(run.grid.t_s)
     states = _plant_states(problem, model, start[2 * plant.free_coordinates :], plant)
-    steps = np.full(nodes, run.substeps)
+    steps = np.full(len(run.strides), run.substeps)
     if parts is not None and run.substeps * int(parts.sum()) <= _MOST_STEPS_IN_ALL:
         steps *= parts
     known = [expected_m]
@@ -107,29 +106,30 @@ def _plant_states(
 def _simulate_heights(
     plant: DartPlant, run: DrivenRun, begin: tuple[tuple[float, ...], Array], steps: Integers
 ) -> Array:
-    """Heights (N, struts) in so many steps after each node, (N,).
+    """Heights (N, struts) in so many steps in each stride, (S + 1,).
 
     `begin` are internal states and the initial vector.
     """
     states, start = begin
-    grid = run.grid
-    count = len(grid.t_s)
+    t_s, count = run.grid.t_s[run.strides], len(run.strides)
     n, (begins, ends) = plant.free_coordinates, (it.tolist() for it in _inputs_of_steps(run, steps))
     numbers = (*start[: 2 * n].tolist(), *states)
-    state = plant.state_of(numbers, float(grid.t_s[0]), begins[0])
+    state = plant.state_of(numbers, float(t_s[0]), begins[0])
     no_forces = (0.0,) * len(plant.spec.struts)
-    heights = np.empty((count, len(no_forces)))
-    lengths, step = (np.diff(grid.t_s) / steps[:-1]).tolist(), 0
-    temperature = grid.temperature_c.tolist()
+    motion = np.empty((count, len(no_forces), 2))
+    lengths, step = (np.diff(t_s) / steps[:-1]).tolist(), 0
+    temperature = run.grid.temperature_c[run.strides].tolist()
     for k in range(count):
-        heights[k] = [height_m for height_m, _ in state.struts]
+        motion[k] = state.struts
         if k + 1 == count:
             break
         for _ in range(steps[k]):
             loaded = plant.load(state, no_forces, begins[step], temperature[k])
             state = plant.step(loaded, lengths[k], ends[step])
             step += 1
-    return heights
+    if count == len(run.grid.t_s):
+        return motion[:, :, 0]
+    return CubicHermiteSpline(t_s, motion[:, :, 0], motion[:, :, 1])(run.grid.t_s)
 
 
 def _inputs_of_steps(run: DrivenRun, steps: Integers) -> tuple[Array, Array]:
