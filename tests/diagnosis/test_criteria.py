@@ -27,6 +27,7 @@ ABSURD = [
     ("least_share", 2.0, "hardening"),
     ("least_above_noise", 1e9, "hardening"),
     ("least_above_noise_later", 1e9, "two_kinds"),
+    ("scatter", 1e9, "hardening"),
     ("bounded", 1e9, "hardening"),
     ("significant", 1e9, "stiffness"),
     ("significant", 0.0, "stiffness"),

@@ -46,6 +46,9 @@ class SelectionCriteria:
             floor; 0.19 is a tenth of the RMS.
         least_above_noise: Mean square above the noise floor, as a share of the floor, below which
             no first law is searched: integration and interpolation err by as much.
+        scatter: Standard deviations of the mean square of as many samples of white noise, that of
+            Gauss, which is added to these shares: the best linear model of a bench that lacks
+            nothing is above the floor in every second recording.
         least_above_noise_later: The same for a further law: the residual of a formula that is
             nearly right is no effect. An RMS 1.1 times the floor: half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which the residual of a
@@ -94,6 +97,7 @@ class SelectionCriteria:
     least_likelihood_gain: float = 30.0
     least_share: float = 0.19
     least_above_noise: float = 0.01
+    scatter: float = 2.0
     least_above_noise_later: float = 0.2
     formula: float = 0.1
     imitation: float = 0.2

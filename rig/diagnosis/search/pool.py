@@ -392,6 +392,7 @@ class Pool:
         """Whether a model is at the noise floor, so that a law could explain nothing more."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
         share = later if model.size else first
+        share += self.criteria.scatter * math.sqrt(2.0 / model.fit.rows)
         return model.cost < (1.0 + share) * self.floor(model)
 
     def floor(self, model: ValidatedModel) -> float:
