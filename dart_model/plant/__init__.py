@@ -19,6 +19,7 @@
 Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -37,6 +38,7 @@ from dart_model.plant.integrator import (
     SHORTEST_STEP_S,
     Linearised,
     exact_step_s,
+    stable_for,
     stable_step_s,
 )
 from dart_model.plant.loops import Loops
@@ -55,6 +57,8 @@ _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1
 share of the largest stiffness below which a direction counts as free."""
 _FARTHEST = 1.0
 """Distance of a rest (m or rad) beyond which nothing holds the bench: no strut is as long."""
+_REACH = 3.0
+"""Times the present acceleration by which a strut may be accelerated until the next tick."""
 _HALVINGS = 6
 """How often a configuration is brought nearer to zero to close its loops there."""
 _DIFFERENCE = 1e-6
@@ -95,8 +99,9 @@ class DartPlant:
         self._slopes_vary = self._geometry.constant is not None and not all(
             strut.is_linear for strut in self._struts
         )
-        self.step_s = self._longest_step_s()
-        """Longest step of the integrator."""
+        self._slope_tables = [strut.slope_tables() for strut in self._struts]
+        self.step_s, self._smooth_step_s, self._mobility_per_kg = self._longest_steps()
+        """Longest step of the integrator where the forces of the struts are steepest."""
 
     @property
     def struts(self) -> int:
@@ -300,11 +305,36 @@ class DartPlant:
 
         Args:
             loaded: State at the beginning and the forces on it; virtual forces are held.
-            dt_s: Duration; divided into steps of at most `step_s`, and into 10 000 at most.
+            dt_s: Duration; divided into steps that are as short as the steepest force asks for that
+                the struts can reach in it, none shorter than `step_s`, and into 10 000 at most.
             inputs_end: Inputs at the end. In between, forces are linear, and motions are the
                 smooth polynomials through those at both ends.
         """
-        return self._equations.step(loaded, dt_s, inputs_end, self.step_s)
+        longest_s = self.step_s
+        if longest_s < self._smooth_step_s:
+            longest_s = self._longest_step_s(loaded, dt_s)
+        return self._equations.step(loaded, dt_s, inputs_end, longest_s)
+
+    def _longest_step_s(self, loaded: Loaded, dt_s: float) -> float:
+        """Longest step with which the model is stable wherever its struts get to in a duration.
+
+        The fastest pole is at most as large as those of a mass, spring and damper with the largest
+        mobility and the steepest slopes (norms of the matrices of `Linearised`).
+        """
+        stiffness = damping = 0.0
+        for (by_height, by_velocity), (z, w), a in zip(
+            self._slope_tables,
+            loaded.state.struts,
+            loaded.accelerations_m_per_s2,
+            strict=True,
+        ):
+            faster = _REACH * abs(a) * dt_s
+            farther = (abs(w) + faster) * dt_s
+            stiffness = max(stiffness, by_height.largest_within(z - farther, z + farther))
+            damping = max(damping, by_velocity.largest_within(w - faster, w + faster))
+        mobility = self._mobility_per_kg
+        fastest = mobility * damping + math.sqrt(mobility * stiffness)
+        return min(self._smooth_step_s, max(self.step_s, stable_for(fastest)))
 
     def slopes(
         self, state: PlantState, inputs: Sequence[float], temperature_c: float
@@ -435,7 +465,8 @@ class DartPlant:
             for other in others
         )
 
-    def _longest_step_s(self) -> float:
+    def _longest_steps(self) -> tuple[float, float, float]:
+        """Longest steps with and without the steepest slopes, and the largest mobility (1/kg)."""
         linear = [(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in self.spec.struts]
         rest = np.zeros(self.coordinates)
         samples = self._sample_places()
@@ -448,9 +479,14 @@ class DartPlant:
                 f"{exact_s:.1g} s ({fastest_hz:.1g} Hz), expected a bench for which "
                 f"{SHORTEST_STEP_S} s is short enough"
             )
-        steepest = [strut.steepest() for strut in self._struts]
+        steepest = [(height.largest, velocity.largest) for height, velocity in self._slope_tables]
         stable_s = min(stable_step_s(_linearise(*bench, steepest)) for bench in benches)
-        return min(LONGEST_STEP_S, exact_s, max(stable_s, SHORTEST_STEP_S))
+        smooth_s = min(LONGEST_STEP_S, exact_s)
+        mobilities = [
+            float(np.linalg.norm(here.struts @ np.linalg.solve(here.mass, here.struts.T), 2))
+            for here, _, _ in benches
+        ]
+        return min(smooth_s, max(stable_s, SHORTEST_STEP_S)), smooth_s, max(mobilities)
 
     def _sample_places(self) -> list[Array]:
         """Generic configurations; with loops those on the way there that they can be closed in."""

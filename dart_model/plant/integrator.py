@@ -135,7 +135,12 @@ def exact_step_s(linear: Linearised) -> float:
 
 def stable_step_s(linear: Linearised) -> float:
     """Longest step with which a bench stays stable at the steepest slopes of its effects."""
-    return _STABLE_STEP / _fastest_rad_per_s(linear)
+    return stable_for(_fastest_rad_per_s(linear))
+
+
+def stable_for(fastest_rad_per_s: float) -> float:
+    """The same by the magnitude of the fastest pole."""
+    return _STABLE_STEP / max(fastest_rad_per_s, 1e-9)
 
 
 def _fastest_rad_per_s(linear: Linearised) -> float:

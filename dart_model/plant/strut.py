@@ -1,10 +1,13 @@
 """A strut: its spring, damper and effects as one force, without DART."""
 
+import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C, effect
 from dart_model.effects.calling import (
@@ -17,6 +20,8 @@ from dart_model.errors import ModelError
 from dart_model.plant.fmu import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
 
+Array = NDArray[np.float64]
+
 _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 """How far from the free length, and how fast, effects are sampled for their steepest slope."""
 
@@ -27,6 +32,29 @@ of a knee."""
 _LARGEST_N = 1e6
 """Force beyond which heights are not sampled: an exponential spring gives any force half a metre
 from its free length, and no bench reaches a meganewton."""
+
+
+class SlopeTable(NamedTuple):
+    """Sizes of a force's slope between neighbouring points of a grid.
+
+    Attributes:
+        points: The grid, rising.
+        sizes: One between two points each; at least that of the linear spring or damper.
+    """
+
+    points: list[float]
+    sizes: list[float]
+
+    @property
+    def largest(self) -> float:
+        """The steepest slope."""
+        return max(self.sizes)
+
+    def largest_within(self, low: float, high: float) -> float:
+        """The steepest slope that a range touches; beyond the grid that at its end."""
+        last = len(self.sizes) - 1
+        first = min(max(bisect_right(self.points, low) - 1, 0), last)
+        return max(self.sizes[first : max(bisect_left(self.points, high), first + 1)])
 
 
 class _Part(NamedTuple):
@@ -145,14 +173,20 @@ class Strut:
         by_velocity = self.force_n(height_m, slow, *others) - self.force_n(height_m, fast, *others)
         return by_height / (2.0 * _SECANT_M), by_velocity / (2.0 * _SECANT_M_PER_S)
 
-    def steepest(self) -> tuple[float, float]:
-        """Largest stiffness (N/m) and damping (N·s/m) with effects, where a bench can get to.
+    def slope_tables(self) -> tuple[SlopeTable, SlopeTable]:
+        """Stiffness (N/m) over height and damping (N·s/m) over velocity, with effects.
+
+        They are sampled where a bench can get to.
 
         Raises:
             ModelError: The parameters of an effect give its law no value.
         """
         if not self._parts:
-            return self._stiffness, self._damping
+            everywhere = [-math.inf, math.inf]
+            return (
+                SlopeTable(everywhere, [self._stiffness]),
+                SlopeTable(everywhere, [self._damping]),
+            )
         heights = self._free_length + np.linspace(-_SAMPLED_M, _SAMPLED_M, 501)
         speeds = np.geomspace(1e-6, _SAMPLED_M_PER_S, 60)
         velocities = np.concatenate([-speeds[::-1], speeds])
@@ -179,8 +213,13 @@ class Strut:
         rates = np.abs(np.diff(by_velocity) / np.diff(velocities))
         if not (np.any(np.isfinite(slopes)) and np.any(np.isfinite(rates))):
             raise ModelError(f"strut {self.name}: gives no force about its free length")
-        stiffness, damping = float(np.nanmax(slopes)), float(np.nanmax(rates))
-        return max(self._stiffness, stiffness), max(self._damping, damping)
+        return _table(heights, slopes, self._stiffness), _table(velocities, rates, self._damping)
+
+
+def _table(points: Array, slopes: Array, least: float) -> SlopeTable:
+    """Slopes as a table; one that is not known is the largest of those that are."""
+    known = np.where(np.isfinite(slopes), slopes, np.nanmax(slopes))
+    return SlopeTable(points.tolist(), np.maximum(known, least).tolist())
 
 
 def struts_of(spec: ModelSpec) -> tuple[Strut, ...]:

@@ -1,13 +1,17 @@
 """Every law of the catalogue acts in the plant as it says: force, memory and mass."""
 
+import itertools
 import math
 
+import numpy as np
 import pytest
 
 from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, Effect
 from dart_model.effects.calling import force_over_arrays
-from dart_model.plant import LONGEST_STEP_S, DartPlant, PlantState
+from dart_model.plant import LONGEST_STEP_S, DartPlant, PlantState, equations_of_motion
+from dart_model.plant.equations_of_motion import count_steps
+from dart_model.plant.strut import SlopeTable
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model, parse_model
 
 AMBIENT_C = 20.0
@@ -129,6 +133,57 @@ def test_a_stiff_law_shortens_the_step():
         state = stiff.step(stiff.load(state, (0.0,), (0.0,), AMBIENT_C), 1e-3, (0.0,))
     # It swings about its rest position a micrometre below, and does not run away.
     assert state.positions[0] == pytest.approx(0.5, abs=3e-6)
+
+
+def heights_and_steps(monkeypatch, plant, applied_n):
+    """Heights under an applied force, shape (ticks,), and the steps that each tick took."""
+    steps = []
+
+    def count(dt_s, longest_s):
+        steps.append(count_steps(dt_s, longest_s))
+        return steps[-1]
+
+    monkeypatch.setattr(equations_of_motion, "count_steps", count)
+    state, heights_m = plant.init([0.4]), []
+    for begin_n, end_n in itertools.pairwise(applied_n.tolist()):
+        state = plant.step(plant.load(state, (0.0,), (begin_n,), AMBIENT_C), 1e-3, (end_n,))
+        heights_m.append(state.struts[0][0])
+    return np.array(heights_m), np.array(steps)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("coulomb_friction", {"coulomb_force_n": 20.0, "rounding_velocity_m_per_s": 2e-4}),
+        ("power_damping", {"force_at_1_m_per_s_n": 60.0, "exponent": 0.3}),
+        (
+            "bump_stop",
+            {"contact_height_m": 0.45, "stiffness_n_per_m": 4e7, "damping_n_s_per_m": 0.0},
+        ),
+    ],
+)
+def test_steps_are_short_where_a_force_is_steep_alone(monkeypatch, name, parameters):
+    plant = with_effect(name, **parameters)
+    t_s = np.arange(2000) * 1e-3
+    applied_n = 60.0 * np.sin(2.0 * np.pi * 1.5 * t_s) + 90.0
+    found_m, steps = heights_and_steps(monkeypatch, plant, applied_n)
+    assert steps.min() == 1
+    assert steps.max() > 2
+    assert steps.mean() < 0.5 * steps.max()
+    everywhere = with_effect(name, **parameters)
+    everywhere._smooth_step_s = everywhere.step_s  # as short as the steepest force asks for
+    exact_m, _ = heights_and_steps(monkeypatch, everywhere, applied_n)
+    assert np.sqrt(np.mean((found_m - exact_m) ** 2)) < 1e-4 * np.ptp(exact_m)
+
+
+def test_the_steepest_slope_within_a_range():
+    table = SlopeTable([0.0, 1.0, 2.0, 3.0], [5.0, 1.0, 7.0])
+    assert table.largest == 7.0
+    assert table.largest_within(1.2, 1.4) == table.largest_within(1.0, 2.0) == 1.0
+    assert table.largest_within(0.5, 1.5) == 5.0
+    assert table.largest_within(1.5, 2.1) == 7.0
+    assert table.largest_within(-4.0, -3.0) == table.largest_within(0.2, 0.2) == 5.0
+    assert table.largest_within(3.0, 9.0) == 7.0
 
 
 def test_a_force_that_no_bench_reaches_does_not_shorten_the_step():

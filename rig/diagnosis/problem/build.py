@@ -216,9 +216,12 @@ def _tones(t_s: Array, force: Array, least_hz: float) -> tuple[tuple[float, floa
     window = np.hanning(len(residual))
     size = next_fast_len(4 * len(residual), real=True)
     for _ in range(2 * _TONES):
-        spectrum = np.fft.rfft(residual * window, size)
-        best = 4 + int(np.argmax(np.abs(spectrum[4:-4])))
-        frequency = best / (size * step)
+        sizes = np.abs(np.fft.rfft(residual * window, size))
+        best = 4 + int(np.argmax(sizes[4:-4]))
+        # A line between two bins: the vertex of the parabola through the largest three.
+        before, at, after = np.log(np.maximum(sizes[best - 1 : best + 2], 1e-300))
+        beyond = 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12)
+        frequency = (best + float(np.clip(beyond, -0.5, 0.5))) / (size * step)
         carrier = 2.0 * np.pi * frequency * t_s
         columns = np.column_stack([np.sin(carrier), np.cos(carrier)])
         (sine, cosine), *_ = np.linalg.lstsq(columns, residual, rcond=None)
