@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from tests.diagnosis_benchmark.acting import overlaps
 from tests.diagnosis_benchmark.comparable import (
     TOTALS,
     Interval,
@@ -51,6 +52,7 @@ class Result:
             of the measured load moves; on a dyno the floor that the diagnosis claims.
         own_floor: The floor that the diagnosis claims.
         intervals: Parameters that the truth can be held against.
+        overlaps: Of where stops and knees show with where they were planted (F1).
         duration_s: Wall time of the diagnosis.
         message: What went wrong, if it failed.
     """
@@ -77,6 +79,7 @@ class Result:
     floor: float
     own_floor: float
     intervals: tuple[Interval, ...]
+    overlaps: tuple[float, ...]
     duration_s: float
     message: str
 
@@ -215,5 +218,6 @@ def judge(
         "false_names": tuple(false_names(case.families, diagnosis, is_rough=is_rough)),
         "unbound": tuple(effect["name"] for effect in found if is_unbound(effect)),
         "intervals": tuple(intervals(case, diagnosis)),
+        "overlaps": () if is_moving else tuple(overlaps(case, diagnosis)),
         "message": diagnosis.get("message", ""),
     }

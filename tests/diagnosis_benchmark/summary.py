@@ -80,8 +80,10 @@ one identifiable parameter (linear corrections, such as another stiffness, do no
 bound* is the share of cases in which the data do not exclude that a named effect has the size zero.
 Each share is given with its 95 % Wilson interval. The intervals of parameters are counted only in
 cases that are right. A case may have several of them; the Wilson interval of their share assumes
-that they are independent, and may be too narrow. The durations depend on the load of the machine,
-which is stated at the end of the page.
+that they are independent, and may be too narrow. *F1 of the range in which it acts* is the overlap
+of the stroke in which a stop shows, and of the speeds at which a knee does, with those at which
+they were planted (twice what is common over the sum of both). The durations depend on the load of
+the machine, which is stated at the end of the page.
 """
 
 
@@ -145,6 +147,7 @@ def figures(results: list[Result]) -> dict[str, object]:
     """Figures of some cases."""
     explained = [result.floor_multiple for result in results if result.verdict == "explained"]
     held = [interval for result in results if result.right for interval in result.intervals]
+    overlaps = [overlap for result in results for overlap in result.overlaps]
     times = [result.duration_s for result in results]
     return {
         "cases": len(results),
@@ -154,6 +157,8 @@ def figures(results: list[Result]) -> dict[str, object]:
         "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
         "explained_worst": _percentile(explained, 100),
         "coverage": rate(interval.holds for interval in held),
+        "overlaps": len(overlaps),
+        "overlap_mean": float(np.mean(overlaps)) if overlaps else None,
         "verdicts": dict(Counter(result.verdict for result in results)),
         "over_floor_median": _percentile((result.floor_multiple for result in results), 50),
         "seconds_median": _percentile(times, 50),
@@ -244,6 +249,7 @@ COLUMNS = (
     Column("not bound", lambda found: str(found["unbound"])),
     Column(f"`explained` within {EXPLAINED_MULTIPLE} noise floors", _explained),
     Column("95 % intervals that contain the truth", lambda found: f"{found['coverage']}"),
+    Column("mean F1 of the range in which it acts", _decimal("overlap_mean", ".2f")),
     Column("median duration, s", _decimal("seconds_median", ".1f")),
     Column("longest duration, s", _decimal("seconds_worst", ".1f")),
 )

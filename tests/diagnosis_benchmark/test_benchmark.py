@@ -8,6 +8,7 @@ from rich.console import Console
 from dart_model.effects import effect
 from tests.diagnosis_benchmark import __main__ as command
 from tests.diagnosis_benchmark import execute as execution
+from tests.diagnosis_benchmark.acting import overlap, overlaps
 from tests.diagnosis_benchmark.bounds import BOUNDS, Bound, violations
 from tests.diagnosis_benchmark.comparable import COMPARABLE, intervals
 from tests.diagnosis_benchmark.execute import (
@@ -401,3 +402,28 @@ def never_end():
 def test_endless_diagnosis_is_broken_off():
     with pytest.raises(TimeoutError, match="no answer within 0 s"), within(0.01):
         never_end()
+
+
+def test_what_shows_beyond_the_planted_contact_overlaps_all_of_it():
+    recorded = (0.3, 0.4)
+    assert overlap([(0.3, 0.32)], (0.32, 9.0), recorded) == pytest.approx(1.0)
+    assert overlap([(0.3, 0.32), (0.38, 0.4)], (0.32, 0.38), recorded) == pytest.approx(1.0)
+    assert overlap([(0.3, 0.34)], (0.32, 9.0), recorded) == pytest.approx(2.0 / 3.0)
+    assert overlap([(0.36, 0.4)], (0.32, 9.0), recorded) == 0.0
+    assert overlap([], (0.2, 0.5), recorded) == 0.0
+
+
+def test_a_stop_and_a_knee_are_held_against_where_they_were_planted():
+    where = {
+        "height_m": [[0.38, 0.4]],
+        "velocity_m_per_s": [[-0.5, -0.1], [0.1, 0.5]],
+        "recorded_height_m": [0.3, 0.4],
+        "recorded_velocity_m_per_s": [-0.5, 0.5],
+    }
+    stop = Planted("stop", "linear_bumper", {"low_m": -1.0, "high_m": 0.38})
+    knee = Planted("nonlinear_damping", "blow_off", {"knee_m_per_s": 0.1})
+    case = case_of(stop, knee)
+    named = [{"family": it.family, "where": where} for it in case.effects]
+    assert list(overlaps(case, {"effects": named})) == pytest.approx([1.0, 1.0])
+    assert list(overlaps(case, {"effects": named[:1]})) == pytest.approx([1.0])
+    assert not list(overlaps(case, {"effects": []}))
