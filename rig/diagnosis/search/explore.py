@@ -39,6 +39,9 @@ _REST_AFTER_TURN = 0.6
 """Share of the work that is left after one more expansion: there are mostly two to four."""
 
 
+_ALIKE = 2
+"""Combinations of the same families that are fitted: of several formulas for one effect the second
+best by a regression may be the best in simulation."""
 _SELDOM = 0.01
 """Share of the time in which a strut has to pull for a contact to be lost in it."""
 
@@ -220,8 +223,22 @@ def _expand_in_simulation(
         for change in pool.changes(model)
         if change.cost < min(least, known.get(change.model.candidate, least))
     ]
-    chosen = _diverse(changes, pool.criteria.fitted_a_size)
+    chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size)
     pool.attempt_all([change.model for change in chosen], progress=within(progress, 0.5, 1.0))
+
+
+def _promising(
+    changes: Sequence[ModelChange], laws: Sequence[StrutEffect], count: int
+) -> list[ModelChange]:
+    """The best changes of a model that add a law, and those that exchange each of its laws.
+
+    Two like laws of each are fitted: a damper's formula is not to be left because a better one for
+    its friction comes first.
+    """
+    chosen = _diverse([change for change in changes if set(laws) <= set(change.laws)], count)
+    for law in laws:
+        chosen += [change for change in changes if law not in change.laws][:_ALIKE]
+    return chosen
 
 
 def _screen_rounds(
@@ -278,7 +295,7 @@ def _diverse(level: Sequence[LawCombination], count: int) -> list[LawCombination
         if len(chosen) >= count:
             break
         families = tuple(sorted(effect(name).family for _, name in screening.laws))
-        if counts.get(families, 0) < 2:
+        if counts.get(families, 0) < _ALIKE:
             chosen.append(screening)
             counts[families] = counts.get(families, 0) + 1
     return chosen
