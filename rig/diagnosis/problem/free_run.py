@@ -385,10 +385,10 @@ class FreeRunProblem(Problem):
             return None
         directions, simulated = directions_of(self.linear, varied, len(parts.effects), run)
         by = by_linear_part(run.mechanism, self.linear, parts.linear, self._middles_m)
-        motion, delays_s = self._empty_motion(run), self._delays(model).struts
-        shape = (*motion.heights_m.shape, directions.columns)
-        late = bool(np.any(delays_s))
-        tangents = Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
+        motion, tangents = (
+            self._empty_motion(run),
+            self._empty_tangents(k, model, directions.columns),
+        )
         slots = slots_of(self, model.candidate)
         if not differentiate(slots, *prepared, directions, by, motion, tangents):
             return None
@@ -405,6 +405,12 @@ class FreeRunProblem(Problem):
                     return None
                 columns[:, i] = changed
         return columns
+
+    def _empty_tangents(self, k: int, model: CandidateModel, columns: int) -> Tangents:
+        """Derivatives of a motion to be filled; those of velocities where a channel is late."""
+        shape = (*self.runs[k].grid.heights_m.shape, columns)
+        late = bool(np.any(self._delays(model).struts))
+        return Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
 
     def _whiten_tangents(
         self, k: int, model: CandidateModel, tangents: Tangents
@@ -436,9 +442,7 @@ class FreeRunProblem(Problem):
         along = track_of(motion, self._before_delays(k, model))
         constants = strut_constants(self, model.parts.linear)
         forces = [track.finite_law_force(along, *law, constants) for law in laws]
-        shape = (*motion.heights_m.shape, len(laws))
-        late = bool(np.any(self._delays(model).struts))
-        tangents = Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
+        tangents = self._empty_tangents(k, model, len(laws))
         pushed = pushed_by([(at[0], n) for (at, _), n in zip(laws, forces, strict=True)], *prepared)
         slots = slots_of(self, model.candidate)
         if not differentiate(slots, *pushed, self._empty_motion(run), tangents):

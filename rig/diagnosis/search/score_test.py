@@ -156,7 +156,7 @@ def _exchanges(base: _Base) -> Iterator[tuple[StrutEffect, StrutEffect]]:
                 yield at, old
 
 
-def _test_sized(base: _Base, laws: Sequence[tuple[StrutEffect, Array]]) -> list[ModelChange | None]:
+def _test_sized(base: _Base, laws: Sequence[tuple[StrutEffect, Array]]) -> list[ModelChange]:
     """Additions of laws that have a size, by the derivative of the residual by it."""
     problem, model = base.problem, base.fit.model
     parts = [problem.law_responses(k, model, laws) for k in range(problem.recordings)]
@@ -165,7 +165,7 @@ def _test_sized(base: _Base, laws: Sequence[tuple[StrutEffect, Array]]) -> list[
         return []
     responses = -np.concatenate(columns)
     responses -= base.basis @ (base.basis.T @ responses)
-    tested: list[ModelChange | None] = []
+    tested: list[ModelChange] = []
     for (at, start), column in zip(laws, responses.T, strict=True):
         size = _best_size(base, column)
         values = scale_law(at[1], start, size)
