@@ -75,9 +75,22 @@ def _balanced_gas(
     return charge_force_n * ((gas_length_m / length) ** polytropic_exponent - 1.0)
 
 
+def _plateau(
+    height_m: float, plateau_force_n: float, centre_height_m: float, half_width_m: float
+) -> float:
+    ratio = (height_m - centre_height_m) / half_width_m
+    return -plateau_force_n * min(max(ratio, -1.0), 1.0)
+
+
 @moving
 def _lengths(motion: Motion) -> list[Start]:
     return grid([1.0], [share * motion.stroke_m for share in (0.1, 0.25, 0.6)])
+
+
+@moving
+def _plateau_starts(motion: Motion) -> list[Start]:
+    widths = [share * motion.stroke_m for share in (0.02, 0.08, 0.2)]
+    return grid([1.0], motion.heights_m(0.2, 0.35, 0.5, 0.65, 0.8), widths)
 
 
 def _deepest_m(motion: Motion) -> float:
@@ -206,6 +219,24 @@ EXPONENTIAL_STIFFNESS = _spring(
     bounds=within(length_m=of_stroke(0.04, 4.0)),
     simpler=("linear_stiffness", "quadratic_stiffness"),
     shown=("force_n",),
+)
+
+PLATEAU_STIFFNESS = _spring(
+    name="plateau_stiffness",
+    words="a spring with a plateau (preloaded)",
+    parameters=(
+        Parameter("plateau_force_n", "N", 1e-12, 1e12, "constant force on either side"),
+        Parameter("centre_height_m", "m", -1e4, 1e4, "height at which the force is zero"),
+        Parameter("half_width_m", "m", 1e-12, 1e4, "deflection from there to either plateau"),
+    ),
+    force=_plateau,
+    excitation="a stroke across both ends of the stiff part",
+    reference="Den Hartog, Mechanical Vibrations (1956), 8.3: set-up springs",
+    starts=_plateau_starts,
+    # Both knees were reached; with one alone it is a stop.
+    bounds=within(centre_height_m=height(0.05, 0.95), half_width_m=of_stroke(0.002, 0.35)),
+    simpler=("linear_stiffness",),
+    shown=("plateau_force_n", "centre_height_m"),
 )
 
 GAS_SPRING = _spring(

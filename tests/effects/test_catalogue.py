@@ -65,6 +65,8 @@ CLOSED_FORMS = [
     ("power_stiffness", [8.0, 3.0], {"height": 0.45}, 1.0),
     ("progressive_stiffness", [3.0, 0.1], {"height": 0.6}, -3.0 * (math.sinh(1.0) - 1.0)),
     ("exponential_stiffness", [3.0, 0.1], {"height": 0.4}, 3.0 * (math.e - 1.0)),
+    ("plateau_stiffness", [30.0, 0.45, 0.1], {"height": 0.4}, 15.0),
+    ("plateau_stiffness", [30.0, 0.45, 0.02], {"height": 0.4}, 30.0),
     ("gas_spring", [100.0, 0.2, 1.4], {"height": 0.4}, 100.0 * 2.0**1.4),
     ("balanced_gas_spring", [100.0, 0.2, 1.0], {"height": 0.4}, 100.0),
     ("bump_stop", [0.4, 1e4, 10.0], {"height": 0.39, "velocity": -1.0}, 110.0),

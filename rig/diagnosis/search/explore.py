@@ -24,11 +24,13 @@ from rig.diagnosis.search.screen import (
     Stage,
     as_screening,
     best_of_each,
+    linear_changes,
     no_law,
     rank_laws,
     refine,
     stage_of,
 )
+from rig.diagnosis.search.validity import find_improbable_linear_part
 
 LawCombination = TypeVar("LawCombination", Screening, ModelChange)
 _IMITATED = ("friction", "nonlinear_damping", "hysteresis")
@@ -81,7 +83,7 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
     if pool.at_floor(pool.linear):
         return None
     first = _screen_single_laws(pool, progress)
-    best = _refine_best_of_each([first.screenings])[:1]
+    best = _refined_level(pool, pool.linear_stage, pool.linear, [first.screenings]).probable[:1]
     if not any(_gains(pool, pool.linear_stage, first.nothing, screening) for screening in best):
         pool.take_every_sample()
         first = _screen_single_laws(pool, progress)
@@ -94,12 +96,13 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         if levels:
             beam = _diverse(levels[-1], criteria.beam)
             rounds = _screen_rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
-        level = _refine_best_of_each(rounds)
+        refined = _refined_level(pool, stage, pool.linear, rounds)
+        level = refined.probable
         if not level or not _gains(
             pool, stage, min(beam, key=lambda screening: screening.validation_cost), level[0]
         ):
             break
-        chosen = _choose_for_fitting(pool, level) + _remove_laws(pool, levels, level[:2])
+        chosen = _choose_for_fitting(pool, refined) + _remove_laws(pool, levels, level[:2])
         levels.append(level)
         part = within(progress, 0.5 * (begin + end), end)
         pool.attempt_screenings(stage, pool.linear, chosen, part)
@@ -198,8 +201,10 @@ def _expand_along_motion(pool: Pool, reference: ValidatedModel, progress: Progre
     """Fit single laws in the order of the regression about a model's motion."""
     stage = stage_of(pool.problem, reference.fit.model)
     rounds = _screen_rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
-    level = [s for s in _refine_best_of_each(rounds) if s.laws != reference.fit.candidate.new]
-    chosen = _choose_for_fitting(pool, level)
+    level = _refined_level(pool, stage, reference, rounds)
+    chosen = [
+        s for s in _choose_for_fitting(pool, level) if s.laws != reference.fit.candidate.new
+    ]
     pool.attempt_screenings(stage, reference, chosen, within(progress, 0.5, 1.0))
 
 
@@ -252,11 +257,42 @@ def _screen_rounds(
     return rounds
 
 
-def _refine_best_of_each(rounds: Sequence[Sequence[Screening]]) -> list[Screening]:
-    """Combinations that were refined along the motion, each at its best, best first."""
-    return best_of_each(
+class _Level(NamedTuple):
+    """Combinations of one size that were refined along the motion, best first.
+
+    Attributes:
+        probable: Those that leave the linear part where the model file admits it; all where none
+            does.
+        better: The best other one, if it is better than all of these.
+    """
+
+    probable: list[Screening]
+    better: list[Screening]
+
+
+def _refined_level(
+    pool: Pool, stage: Stage, reference: ValidatedModel, rounds: Sequence[Sequence[Screening]]
+) -> _Level:
+    """Combinations that were refined about a reference, each at its best."""
+    refined = best_of_each(
         screening for screenings in rounds for screening in screenings if screening.values
     )
+    lawless, about = pool.linear.fit.parts.linear, reference.fit.parts.linear
+    probable = [
+        screening
+        for screening in refined
+        if find_improbable_linear_part(
+            pool.problem,
+            screening.laws,
+            about + linear_changes(stage, screening),
+            lawless,
+            pool.criteria,
+        )
+        is None
+    ]
+    if not probable or probable[0] is refined[0]:
+        return _Level(probable or refined, [])
+    return _Level(probable, refined[:1])
 
 
 def _remove_laws(
@@ -281,10 +317,11 @@ def _remove_laws(
     return smaller
 
 
-def _choose_for_fitting(pool: Pool, level: Sequence[Screening]) -> list[Screening]:
-    least = pool.criteria.hopeless * min((s.validation_cost for s in level), default=0.0)
-    diverse = _diverse(level, pool.criteria.fitted_a_size)
-    return [screening for screening in diverse if screening.validation_cost <= least]
+def _choose_for_fitting(pool: Pool, level: _Level) -> list[Screening]:
+    """Combinations to be fitted; one that is not probable may lead to one that is."""
+    least = pool.criteria.hopeless * min((s.validation_cost for s in level.probable), default=0.0)
+    diverse = _diverse(level.probable, pool.criteria.fitted_a_size)
+    return [*level.better, *(s for s in diverse if s.validation_cost <= least)]
 
 
 def _diverse(level: Sequence[LawCombination], count: int) -> list[LawCombination]:

@@ -33,7 +33,9 @@ def list_rejections(
     """Laws that were not chosen, best first; `first` are models of the search about no law."""
     screenings, laws = first_round.screenings, set(chosen.fit.candidate.new)
     tied = {law for rival in rivals for law in rival.fit.candidate.new}
-    best = min(screenings, key=lambda screening: screening.share, default=None)
+    # What is not believed itself is no reason against another law.
+    believed = (s for s in screenings if not _is_defective(pool, first, s.laws[-1]))
+    best = min(believed, key=lambda screening: screening.share, default=None)
     rejected: dict[StrutEffect, RejectedEffect] = {}
     for screening in screenings:
         law = screening.laws[-1]
@@ -53,6 +55,11 @@ def list_rejections(
             left,
         )
     return tuple(sorted(rejected.values(), key=lambda item: item.left or 0.0))
+
+
+def _is_defective(pool: Pool, first: Pool, law: StrutEffect) -> bool:
+    candidate = nominal(pool.problem).with_effects(law)
+    return candidate in pool.invalid or candidate in first.invalid
 
 
 def _fitted_in(pool: Pool, first: Pool, chosen: ValidatedModel, law: StrutEffect) -> Pool | None:
@@ -92,7 +99,7 @@ def _in_simulation(
 
 def _along_motion(screening: Screening, best: Screening | None) -> tuple[float, str]:
     left = min(float(np.sqrt(max(screening.share, 0.0))), 1.0)
-    if best is None or best is screening:
+    if best is None or best.share >= screening.share:
         return left, "along the motion it reduces the residual too little to be fitted"
     words, least = effect(best.laws[-1][1]).words, float(np.sqrt(max(best.share, 0.0)))
     return left, f"along the motion {words} leaves less: {100.0 * least:.3g} %"

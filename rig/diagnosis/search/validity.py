@@ -77,7 +77,9 @@ def find_defect(
         or _find_linear_law(result, forces, along, criteria)
         or _find_cancelling_laws(result, forces, criteria)
         or _find_active_strut(problem, result, along, criteria)
-        or _find_improbable_linear_part(problem, result, lawless, criteria)
+        or find_improbable_linear_part(
+            problem, result.candidate.new, result.parts.linear, lawless, criteria
+        )
         or _find_harmonic_of_drive(result, along, law_values(problem, result))
     )
 
@@ -166,16 +168,24 @@ def _find_cancelling_laws(
     return None
 
 
-def _find_improbable_linear_part(
-    problem: Problem, result: Fit, lawless: Array, criteria: SelectionCriteria
+def find_improbable_linear_part(
+    problem: Problem,
+    laws: Sequence[StrutEffect],
+    linear: Array,
+    lawless: Array,
+    criteria: SelectionCriteria,
 ) -> str | None:
     """Reason against laws that require a linear part far from the model file's.
 
     Only where no correction without a law goes as far. Laws of a spring may replace the linear one,
     and laws of a damper the linear damping.
+
+    Args:
+        linear: Corrections together with the laws, shape (L,).
+        lawless: Those of the best linear model, shape (L,).
     """
-    families = {(strut, effect(name).family) for strut, name in result.candidate.new}
-    for p, change, alone in zip(problem.linear, result.parts.linear, lawless, strict=True):
+    families = {(strut, effect(name).family) for strut, name in laws}
+    for p, change, alone in zip(problem.linear, linear, lawless, strict=True):
         if p.kind not in _REPLACED:
             continue
         is_replaced = change < 0.0 and any(
