@@ -202,9 +202,7 @@ def _expand_along_motion(pool: Pool, reference: ValidatedModel, progress: Progre
     stage = stage_of(pool.problem, reference.fit.model)
     rounds = _screen_rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
     level = _refined_level(pool, stage, reference, rounds)
-    chosen = [
-        s for s in _choose_for_fitting(pool, level) if s.laws != reference.fit.candidate.new
-    ]
+    chosen = [s for s in _choose_for_fitting(pool, level) if s.laws != reference.fit.candidate.new]
     pool.attempt_screenings(stage, reference, chosen, within(progress, 0.5, 1.0))
 
 

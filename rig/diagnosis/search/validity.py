@@ -178,11 +178,8 @@ def find_improbable_linear_part(
     """Reason against laws that require a linear part far from the model file's.
 
     Only where no correction without a law goes as far. Laws of a spring may replace the linear one,
-    and laws of a damper the linear damping.
-
-    Args:
-        linear: Corrections together with the laws, shape (L,).
-        lawless: Those of the best linear model, shape (L,).
+    and laws of a damper the linear damping. `linear` are the corrections together with the laws,
+    `lawless` those of the best linear model, shapes (L,).
     """
     families = {(strut, effect(name).family) for strut, name in laws}
     for p, change, alone in zip(problem.linear, linear, lawless, strict=True):
