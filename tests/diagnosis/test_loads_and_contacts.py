@@ -1,4 +1,4 @@
-"""Friction that grows with a load, and contacts that are lost and met again."""
+"""Friction that grows with a load, contacts that are lost and met again, preloaded springs."""
 
 import math
 
@@ -34,6 +34,15 @@ class Lifting(bench.Nothing):
         return max(bench.STIFFNESS * (z - bench.FREE) + bench.DAMPING * v, 0.0)
 
 
+class Preloaded(bench.Nothing):
+    """A spring that holds up to 12 N, and gives way on either side."""
+
+    fine = 40
+
+    def force(self, t, z, v, state):
+        return -12.0 * min(max((z - 0.36) / 0.003, -1.0), 1.0)
+
+
 class LiftingStrut(dyno.Nothing):
     def force(self, t, z, v, state, warm):
         return max(dyno.STIFFNESS * (z - dyno.FREE) + dyno.DAMPING * v, 0.0)
@@ -55,6 +64,17 @@ def test_friction_under_a_load_is_found_with_its_share(effect, name, truth):
         estimate = found.effects[0].parameters[key]
         assert estimate.value == pytest.approx(value, rel=0.03)
         assert holds(estimate, value)
+
+
+@pytest.mark.slow
+def test_a_preloaded_spring_is_found_with_its_plateau():
+    runs = [bench.run(Preloaded(), seed=seed) for seed in (1, 2)]
+    found = diagnose(bench.model(stiffness=0.9 * bench.STIFFNESS), runs[:1], runs[1:]).diagnosis
+    names = [item.name for item in found.effects]
+    assert (found.verdict, names) == ("explained", ["plateau_stiffness"])
+    truth = {"plateau_force_n": 12.0, "centre_height_m": 0.36, "half_width_m": 0.003}
+    for key, value in truth.items():
+        assert holds(found.effects[0].parameters[key], value)
 
 
 @pytest.mark.slow

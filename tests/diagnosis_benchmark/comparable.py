@@ -81,6 +81,15 @@ COMPARABLE: dict[str, tuple[Same, ...]] = {
         for name in ("gas_spring", "balanced_gas_spring")
         for theirs, ours in (("gas_length_m", "column_m"), ("polytropic_exponent", "exponent"))
     ),
+    "set_up_spring": (
+        _of("plateau_stiffness", "plateau_force_n", "force_n"),
+        _of("plateau_stiffness", "half_width_m", "half_width_m"),
+        Same(
+            "plateau_stiffness",
+            "centre_height_m",
+            lambda truth, bench: bench.free_length_m + truth["centre_m"],
+        ),
+    ),
     "hertz_bumper": (
         *_CONTACTS,
         *(

@@ -61,6 +61,7 @@ CODES: dict[str, tuple[str, ...]] = {
     "fractional": ("coefficient_n", "order"),
     "gated_spring": ("stiffness_n_per_m",),
     "detent": ("force_n", "centre_m", "width_m"),
+    "set_up_spring": ("force_n", "centre_m", "half_width_m"),
     "rigid_mass": ("mass_kg",),
     "accel_square": ("coefficient_n_s4_per_m2",),
 }
@@ -124,6 +125,7 @@ MEMORY = {
     _FRACTIONAL,
     _GATED,
     _DETENT,
+    _SET_UP,
     _RIGID_MASS,
     _ACCEL_SQUARE,
 ) = range(len(CODES))
@@ -144,7 +146,7 @@ _KIND_OF = {
     _IS_CONTACT: (_HERTZ, _LINEAR_STOP, _RUBBER),
     _IS_PLAY: (_FREE_PLAY, _SOFT_PLAY),
     _IS_SPEED: (_DAMPING, _ORIFICE, _ONE_WAY, _ARCTAN, _BLOW_OFF, _MIXED),
-    _IS_PLACED: (_TAPER, _GROOVE, _COGGING, _RIPPLE, _GATED, _DETENT),
+    _IS_PLACED: (_TAPER, _GROOVE, _COGGING, _RIPPLE, _GATED, _DETENT, _SET_UP),
     _IS_FADE: (_THIN_OIL, _TIME_FADE, _WORK_FADE),
     _IS_REMEMBERED: (
         _BRISTLE,
@@ -303,6 +305,8 @@ def _placed_force(code, p, x, v, gate):
     if code == _GATED:
         return -p[0] * gate * x
     u = (x - p[1]) / p[2]
+    if code == _SET_UP:
+        return -p[0] * _clip(u, 1.0)
     return -p[0] * u * math.exp(0.5 - 0.5 * u * u)
 
 

@@ -125,6 +125,16 @@ def _gas(rng: Rng, nominal: Nominal, strength: float) -> Planted:
     return Planted("nonlinear_stiffness", "gas_column", truth)
 
 
+def _set_up(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    spread = float(np.std(nominal.x_m))
+    centre = float(np.median(nominal.x_m)) + spread * float(rng.uniform(-0.5, 0.5))
+    half_width = spread * _log(rng, 0.1, 0.7)
+    shape = np.clip((nominal.x_m - centre) / half_width, -1.0, 1.0)
+    size = nominal.coefficient(strength, shape)
+    truth = {"force_n": size, "centre_m": centre, "half_width_m": half_width}
+    return Planted("nonlinear_stiffness", "set_up_spring", truth)
+
+
 def _stop(rng: Rng, nominal: Nominal, strength: float) -> Planted:
     # Reached at the outer 3 to 25 % of the swing, on one side or on both.
     z = nominal.x_m + nominal.bench.free_length_m
@@ -433,7 +443,7 @@ DRAWS: dict[str, tuple[Draw, ...]] = {
     "damping": (_damping,),
     "inertia": (_inertia,),
     "input_gain": (_input_gain,),
-    "nonlinear_stiffness": (_square, _cube, _power, _exponential, _gas),
+    "nonlinear_stiffness": (_square, _cube, _power, _exponential, _gas, _set_up),
     "stop": (_stop,),
     "backlash": (_backlash,),
     "friction": (_friction,),

@@ -87,6 +87,14 @@ class DrivenRun(NamedTuple):
             cells=cells,
         )
 
+    def held_to(self, motion: Track, rate_rad_per_s: float) -> "DrivenRun":
+        """The recording of a model that is held to a motion, as `LinearisedMechanism.held_to`."""
+        heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
+        mechanism = self.mechanism.held_to(
+            heights_m, velocities, self.moved_at_nodes, rate_rad_per_s
+        )
+        return self._replace(mechanism=mechanism)
+
     def finer(self) -> "DrivenRun":
         """The recording with steps half as long."""
         steps = 2 * self.substeps

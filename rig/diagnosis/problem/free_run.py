@@ -217,6 +217,19 @@ class FreeRunProblem(Problem):
     def in_usual_steps(self) -> "FreeRunProblem":
         return replace(self, in_strides=())
 
+    def held_to(
+        self, motions: Sequence[tuple[int, Track]], share: float
+    ) -> "FreeRunProblem | None":
+        along, rate = dict(motions), share * max(run.fastest for run in self.runs)
+        if len(along) < self.recordings:
+            return None
+        runs = tuple(run.held_to(along[k], rate) for k, run in enumerate(self.runs))
+        in_strides = tuple(
+            other._replace(mechanism=run.mechanism)
+            for run, other in zip(runs, self.in_strides, strict=False)
+        )
+        return replace(self, runs=runs, in_strides=in_strides)
+
     def finer(self) -> "FreeRunProblem":
         """The problem with steps half as long: the integrator then errs a sixteenth."""
         return replace(self, runs=tuple(run.finer() for run in self.runs), in_strides=())

@@ -97,6 +97,36 @@ class LinearisedMechanism(NamedTuple):
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
         return solve_nearest(np.swapaxes(jacobian, 1, 2), generalised)
 
+    def held_to(
+        self, z: Array, w: Array, moved: Array, rate_rad_per_s: float
+    ) -> "LinearisedMechanism":
+        """The mechanism held to a motion by springs and dampers on all that has a mass.
+
+        Critically damped at a rate: they act as the gains of an observer do.
+
+        Args:
+            z: Heights of the motion, shape (N, struts).
+            w: Their rates.
+            moved: What moved bodies add to both, shape (N, 2, struts).
+            rate_rad_per_s: How fast an error decays that has no other cause.
+        """
+        repeats = 1 if self.is_tabulated else len(z)
+        m = LinearisedMechanism(*(np.repeat(part, repeats, axis=0) for part in self))
+        q = m.q + solve_nearest(m.jacobian, z - m.heights_m - moved[:, 0])
+        v = solve_nearest(m.jacobian, w - moved[:, 1])
+        bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
+        bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
+        held = m._replace(
+            q=q,
+            v=v,
+            heights_m=m.heights_m + np.einsum("kij,kj->ki", m.jacobian, q - m.q),
+            rates_m_per_s=np.einsum("kij,kj->ki", m.jacobian, v),
+            bias=bias,
+            bias_q=m.bias_q - rate_rad_per_s**2 * m.mass,
+            bias_v=m.bias_v - 2.0 * rate_rad_per_s * m.mass,
+        )
+        return LinearisedMechanism(*(np.ascontiguousarray(part) for part in held))
+
     def without_balance(self, forces: Array) -> Array:
         """Strut forces (N, struts) without a part that is in balance with itself.
 

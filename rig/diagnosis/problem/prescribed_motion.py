@@ -213,6 +213,9 @@ class PrescribedProblem(Problem):
         """The problem itself, likewise."""
         return self
 
+    def held_to(self, motions: Sequence[tuple[int, Track]], share: float) -> None:
+        del motions, share
+
     def finer(self) -> None:
         """None: nothing is integrated."""
         return

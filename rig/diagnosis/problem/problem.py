@@ -333,6 +333,14 @@ class Problem(ABC):
         """The problem with steps half as long as usual ones; None where nothing is integrated."""
 
     @abstractmethod
+    def held_to(self, motions: Sequence[tuple[int, Track]], share: float) -> Self | None:
+        """The problem of a model that is held to the motion of each recording, given by its index.
+
+        Springs and dampers hold it, at a share of the rate of its fastest motion: its errors do not
+        add up. None where it is moved as measured anyway, or a recording has no motion.
+        """
+
+    @abstractmethod
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> Self:
         """The problem of pieces of recordings, each given by its recording's index and its nodes.
 

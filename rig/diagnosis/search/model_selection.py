@@ -9,10 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
+from dart_model.effects.calling import arguments
 from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.channel_delays import is_undetermined
-from rig.diagnosis.problem.problem import Candidate, CandidateModel, Problem, StrutEffect
+from rig.diagnosis.problem.problem import (
+    Candidate,
+    CandidateModel,
+    Problem,
+    StrutEffect,
+    nominal,
+)
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
@@ -235,7 +242,25 @@ def _with_one_of(
             for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
                 if screening.values and screening.validation_cost <= most():
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
+            _attempt_about_model_file(pool, known, law, other)
         yield from _converge_candidate(pool, candidate, chosen)
+
+
+def _attempt_about_model_file(
+    pool: Pool, known: Mapping[StrutEffect, Array], law: StrutEffect, other: StrutEffect
+) -> None:
+    """Fit a law that reads the strut's spring, with those parameters that another one has too.
+
+    Beside the best linear model's spring it is another law than beside the model file's: that of
+    a spring with free play is the spring of play and stroke together.
+    """
+    item, own = effect(other[1]), effect(law[1]).named(known[law])
+    reads_strut = any(read.origin == "strut" for read in arguments(item.force, item))
+    if not reads_strut or not all(p.name in own for p in item.parameters):
+        return
+    values = {at: those for at, those in known.items() if at != law}
+    values[other] = np.array([own[p.name] for p in item.parameters])
+    pool.attempt_at_nominal(nominal(pool.problem).with_effects(*values), values)
 
 
 def _neighbours(problem: Problem, law: StrutEffect) -> list[str]:

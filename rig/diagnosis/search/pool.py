@@ -1,7 +1,15 @@
 """Fitted models, and the rules by which one is preferred to another.
 
-Reference: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees (1984), 3.4.3, the
-one-standard-error rule.
+A free run with impacts or play may part from the measurement wherever its parameters are not all
+but right, and its fit then ends anywhere. A model that is held to the measured motion does not: it
+is fitted first, and then let go.
+
+References:
+    Breiman, Friedman, Olshen, Stone, Classification and Regression Trees (1984), 3.4.3, the
+    one-standard-error rule.
+    Abarbanel, Creveling, Farsian, Kostuk, Dynamical state and parameter estimation, SIAM J. Appl.
+    Dyn. Syst. 8 (2009): models that are coupled to the data, less and less.
+    Ljung, System Identification (1999), 3.2: prediction errors of a model with an observer.
 """
 
 import math
@@ -52,6 +60,8 @@ Array = NDArray[np.float64]
 
 _STARTS = Effort(8, 1e-2, 1)
 """Fits of initial states alone."""
+_NEAR = Effort(4, 1e-2, 1)
+"""Fits of held models, from which a fit of the free run begins."""
 ROUGH = Effort(8, 1e-3, 1)
 """Fits that are compared among themselves."""
 FULL = Effort(20, 1e-4, 2)
@@ -60,6 +70,11 @@ FINAL = Effort(15, 1e-6, 2)
 """The fit that is reported; that of a free run once more with finer steps."""
 
 
+_HELD = (1.0, 0.3, 0.1)
+"""Rates at which models are held to the measured motion, as shares of that of their fastest."""
+_RIGHT, _PARTED = 10.0, 1e3
+"""Mean squares of the residual of a held model up to which it is nearly right, and of its free run
+from which on that has parted from the measurement: what a model lacks is amplified by less."""
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -131,6 +146,12 @@ class Pool:
         """The regression about the best linear model."""
         return stage_of(self.problem, self.linear.fit.model)
 
+    @cached_property
+    def held(self) -> tuple[Problem, ...]:
+        """Problems of models that are held to the measured motion, less and less."""
+        problems = (self.problem.held_to(self.along, share) for share in _HELD)
+        return tuple(problem for problem in problems if problem is not None)
+
     def take_every_sample(self) -> None:
         """Take every sample in the regression about the best linear model."""
         self.linear_stage = whole_stage_of(self.problem, self.linear.fit.model)
@@ -145,11 +166,14 @@ class Pool:
         self, model: CandidateModel, most_level: float = np.inf, *, effort: Effort
     ) -> Fit | None:
         """Fit a model with all linear parameters that may be fitted together with its laws."""
-        candidate, parts = model
-        free = free_linear(self.problem, candidate)
+        return self._refit(self.problem, Begin(model, most_level), effort)
+
+    def _refit(self, problem: Problem, begin: Begin, effort: Effort) -> Fit | None:
+        (candidate, parts), most_level = begin
+        free = free_linear(problem, candidate)
         parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
         first = CandidateModel(candidate, parts)
-        return fit(self.problem, first, free, effort, most_level=most_level)
+        return fit(problem, first, free, effort, most_level=most_level)
 
     def attempt(self, model: CandidateModel, effort: Effort = ROUGH) -> None:
         """Fit a model in simulation and keep the better of this and an earlier fit."""
@@ -175,11 +199,12 @@ class Pool:
 
         Begins and fits are independent of each other, and take a thread each.
         """
+        _ = self.held  # Made once, here: not by each thread.
         for candidate, _ in jobs:
             slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
 
         def fit_one(begin: Callable[[], Begin]) -> ValidatedModel | None:
-            result = self.refit(*begin(), effort=effort)
+            result = self._fit_from(begin(), effort)
             return None if result is None else self.validate(result)
 
         with ThreadPoolExecutor(cpu_count()) as threads:
@@ -192,6 +217,24 @@ class Pool:
                     self.converged.add(candidate)
                 if model is not None:
                     self._keep(candidate, model)
+
+    def _fit_from(self, begin: Begin, effort: Effort) -> Fit | None:
+        """Fit a model from where it begins, first while it is held to the measured motion."""
+        if not self.held:
+            return self.refit(*begin, effort=effort)
+        held = self._refit(self.held[0], begin, _NEAR)
+        if held is None:
+            return self.refit(*begin, effort=effort)
+        result = self.refit(held.model, begin.most_level, effort=effort)
+        is_right = held.mean_square < _RIGHT
+        if result is not None and not (is_right and result.mean_square > _PARTED):
+            return result
+        for problem in self.held[1:]:
+            held = self._refit(problem, Begin(held.model, begin.most_level), effort) or held
+        other = self.refit(held.model, begin.most_level, effort=effort)
+        if result is None or (other is not None and other.mean_square < result.mean_square):
+            return other
+        return result
 
     def _keep(self, candidate: Candidate, model: ValidatedModel) -> None:
         if candidate in self.fits and model.cost >= self.fits[candidate].cost:

@@ -1,0 +1,75 @@
+"""Models that are held to the measured motion: their errors do not add up."""
+
+import numpy as np
+import pytest
+
+from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.problem.problem import free_linear, nominal
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.fit import fit
+from rig.diagnosis.search.pool import FULL, Pool
+from rig.diagnosis.search.validity import smooth_tracks
+from tests.diagnosis import little_bench as bench
+from tests.diagnosis.test_derivatives import model_with
+
+PRELOAD_N = 5.0
+DAMPING = 4.0
+GAP_M = 0.06
+
+
+class WidePlay(bench.Nothing):
+    """Hardly damped, and with so much play that neighbouring motions soon part."""
+
+    fine = 40
+
+    def force(self, t, z, v, state):
+        slack_m = min(max(z - 0.4, -0.5 * GAP_M), 0.5 * GAP_M)
+        return (bench.DAMPING - DAMPING) * v + bench.STIFFNESS * slack_m
+
+
+def problem_of(effect, damping=bench.DAMPING, **kwargs):
+    record = bench.run(effect, noise_m=1e-6, gravity=0.0, **kwargs)
+    return build_without_delays(bench.model(gravity=0.0, damping=damping), [record], 32, None)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0, 3.0])
+def test_a_constant_force_bends_a_held_model_against_its_spring_and_the_holding_one(share):
+    problem = problem_of(bench.Nothing())
+    given = first_fits(problem)[0]
+    held = problem.held_to(smooth_tracks(problem, given), share)
+    forces = [PRELOAD_N * (p.kind == "preload") for p in problem.linear]
+    wrong = given.model.with_linear(np.array(forces))
+    rate = share * problem.runs[0].fastest
+    stiffness = bench.STIFFNESS + bench.MASS * rate**2
+    settled = len(held.residual(0, wrong)) // 2
+    bent_m = float(np.mean(held.residual(0, wrong)[settled:] * held.noise_m[0]))
+    assert bent_m == pytest.approx(-PRELOAD_N / stiffness, rel=0.01)
+
+
+def test_a_right_model_is_not_moved_by_what_holds_it():
+    problem = problem_of(bench.Nothing())
+    given = first_fits(problem)[0]
+    held = problem.held_to(smooth_tracks(problem, given), 1.0)
+    assert rms(held.residual(0, given.model)) < 1.05 * rms(problem.residual(0, given.model))
+
+
+def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins():
+    problem = problem_of(
+        WidePlay(), damping=DAMPING, duration_s=20.0, load=lambda t: 0.3 * bench.load_n(t)
+    )
+    given, linear = first_fits(problem)
+    law = (0, "free_play")
+    candidate = nominal(problem).with_effects(law)
+    begun = model_with(problem, {law: np.array([0.4, 1.01 * GAP_M])}, {})
+    directly = fit(problem, begun, free_linear(problem, candidate), FULL)
+    assert directly.mean_square > 1e6
+    pool = Pool(problem, given, [linear], CRITERIA)
+    pool.attempt(begun, FULL)
+    found = pool.fits[candidate].fit
+    assert found.mean_square < 1.5
+    assert found.parts.effects == pytest.approx([0.4, GAP_M], rel=1e-4)
