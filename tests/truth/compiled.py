@@ -142,11 +142,11 @@ MEMORY = {
 ) = range(8)
 
 _KIND_OF = {
-    _IS_SPRING: (_STIFFNESS, _SQUARE, _CUBE, _POWER, _EXPONENTIAL, _TANGENT, _GAS),
+    _IS_SPRING: (_STIFFNESS, _SQUARE, _CUBE, _POWER, _EXPONENTIAL, _TANGENT, _GAS, _SET_UP),
     _IS_CONTACT: (_HERTZ, _LINEAR_STOP, _RUBBER),
     _IS_PLAY: (_FREE_PLAY, _SOFT_PLAY),
     _IS_SPEED: (_DAMPING, _ORIFICE, _ONE_WAY, _ARCTAN, _BLOW_OFF, _MIXED),
-    _IS_PLACED: (_TAPER, _GROOVE, _COGGING, _RIPPLE, _GATED, _DETENT, _SET_UP),
+    _IS_PLACED: (_TAPER, _GROOVE, _COGGING, _RIPPLE, _GATED, _DETENT),
     _IS_FADE: (_THIN_OIL, _TIME_FADE, _WORK_FADE),
     _IS_REMEMBERED: (
         _BRISTLE,
@@ -245,6 +245,8 @@ def _contact_force(code, p, z, v):
 @numba.njit(cache=True, error_model="numpy")
 def _stiffening_force(code, p, x):
     """Springs with a limit or a growth of their own."""
+    if code == _SET_UP:
+        return -p[0] * _clip((x - p[1]) / p[2], 1.0)
     if code == _EXPONENTIAL:
         return p[0] * math.expm1(-x / p[1])
     if code == _TANGENT:
@@ -305,8 +307,6 @@ def _placed_force(code, p, x, v, gate):
     if code == _GATED:
         return -p[0] * gate * x
     u = (x - p[1]) / p[2]
-    if code == _SET_UP:
-        return -p[0] * _clip(u, 1.0)
     return -p[0] * u * math.exp(0.5 - 0.5 * u * u)
 
 
