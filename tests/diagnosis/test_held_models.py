@@ -6,9 +6,11 @@ import pytest
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.problem.problem import free_linear, nominal
+from rig.diagnosis.progress import no_progress
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import fit
 from rig.diagnosis.search.pool import FULL, Pool
+from rig.diagnosis.search.score_test import ModelChange
 from rig.diagnosis.search.validity import smooth_tracks
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.test_derivatives import model_with
@@ -69,7 +71,7 @@ def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins():
     directly = fit(problem, begun, free_linear(problem, candidate), FULL)
     assert directly.mean_square > 1e6
     pool = Pool(problem, given, [linear], CRITERIA)
-    pool.attempt(begun, FULL)
+    pool.attempt_changes([ModelChange(begun, float(directly.rows))], no_progress)
     found = pool.fits[candidate].fit
     assert found.mean_square < 1.5
     assert found.parts.effects == pytest.approx([0.4, GAP_M], rel=1e-4)

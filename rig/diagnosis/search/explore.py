@@ -227,7 +227,7 @@ def _expand_in_simulation(
         if change.cost < min(least, known.get(change.model.candidate, least))
     ]
     chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size)
-    pool.attempt_all([change.model for change in chosen], progress=within(progress, 0.5, 1.0))
+    pool.attempt_changes(chosen, within(progress, 0.5, 1.0))
 
 
 def _promising(

@@ -2,7 +2,7 @@
 
 A free run with impacts or play may part from the measurement wherever its parameters are not all
 but right, and its fit then ends anywhere. A model that is held to the measured motion does not: it
-is fitted first, and then let go.
+is fitted, and then let go.
 
 References:
     Breiman, Friedman, Olshen, Stone, Classification and Regression Trees (1984), 3.4.3, the
@@ -60,8 +60,6 @@ Array = NDArray[np.float64]
 
 _STARTS = Effort(8, 1e-2, 1)
 """Fits of initial states alone."""
-_NEAR = Effort(4, 1e-2, 1)
-"""Fits of held models, from which a fit of the free run begins."""
 ROUGH = Effort(8, 1e-3, 1)
 """Fits that are compared among themselves."""
 FULL = Effort(20, 1e-4, 2)
@@ -72,9 +70,10 @@ FINAL = Effort(15, 1e-6, 2)
 
 _HELD = (1.0, 0.3, 0.1)
 """Rates at which models are held to the measured motion, as shares of that of their fastest."""
-_RIGHT, _PARTED = 10.0, 1e3
-"""Mean squares of the residual of a held model up to which it is nearly right, and of its free run
-from which on that has parted from the measurement: what a model lacks is amplified by less."""
+_RIGHT, _PARTED = 100.0, 1e3
+"""Mean square of a residual up to which a regression promises a nearly right model, and times that
+from which on the fit of its free run has parted from the measurement: what a model lacks is
+amplified by less."""
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -113,10 +112,13 @@ class Begin(NamedTuple):
 
     Attributes:
         most_level: As of `rig.diagnosis.search.fit.fit`.
+        promised: Mean square of the residual that it reaches, as a regression shows; infinite where
+            nothing is known of it.
     """
 
     model: CandidateModel
     most_level: float = np.inf
+    promised: float = np.inf
 
 
 class Pool:
@@ -169,11 +171,11 @@ class Pool:
         return self._refit(self.problem, Begin(model, most_level), effort)
 
     def _refit(self, problem: Problem, begin: Begin, effort: Effort) -> Fit | None:
-        (candidate, parts), most_level = begin
+        candidate, parts = begin.model
         free = free_linear(problem, candidate)
         parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
         first = CandidateModel(candidate, parts)
-        return fit(problem, first, free, effort, most_level=most_level)
+        return fit(problem, first, free, effort, most_level=begin.most_level)
 
     def attempt(self, model: CandidateModel, effort: Effort = ROUGH) -> None:
         """Fit a model in simulation and keep the better of this and an earlier fit."""
@@ -189,6 +191,15 @@ class Pool:
         jobs = [(model.candidate, partial(Begin, model)) for model in models]
         self._fit_each(jobs, effort, progress)
 
+    def attempt_changes(self, changes: Sequence[ModelChange], progress: Progress) -> None:
+        """Fit changed models in simulation, some at a time."""
+        rows = self.linear.fit.rows
+        jobs = [
+            (change.model.candidate, partial(Begin, change.model, promised=change.cost / rows))
+            for change in changes
+        ]
+        self._fit_each(jobs, ROUGH, progress)
+
     def _fit_each(
         self,
         jobs: Sequence[tuple[Candidate, Callable[[], Begin]]],
@@ -199,7 +210,6 @@ class Pool:
 
         Begins and fits are independent of each other, and take a thread each.
         """
-        _ = self.held  # Made once, here: not by each thread.
         for candidate, _ in jobs:
             slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
 
@@ -219,22 +229,18 @@ class Pool:
                     self._keep(candidate, model)
 
     def _fit_from(self, begin: Begin, effort: Effort) -> Fit | None:
-        """Fit a model from where it begins, first while it is held to the measured motion."""
-        if not self.held:
-            return self.refit(*begin, effort=effort)
-        held = self._refit(self.held[0], begin, _NEAR)
-        if held is None:
-            return self.refit(*begin, effort=effort)
-        result = self.refit(held.model, begin.most_level, effort=effort)
-        is_right = held.mean_square < _RIGHT
-        if result is not None and not (is_right and result.mean_square > _PARTED):
+        """Fit a model in free run; where that parts, once more from a model that is let go."""
+        result = self._refit(self.problem, begin, effort)
+        parted = result is None or result.mean_square > _PARTED * begin.promised
+        if begin.promised > _RIGHT or not parted or not self.held:
             return result
-        for problem in self.held[1:]:
-            held = self._refit(problem, Begin(held.model, begin.most_level), effort) or held
-        other = self.refit(held.model, begin.most_level, effort=effort)
-        if result is None or (other is not None and other.mean_square < result.mean_square):
-            return other
-        return result
+        for problem in self.held:
+            held = self._refit(problem, begin, effort)
+            begin = begin if held is None else begin._replace(model=held.model)
+        other = self._refit(self.problem, begin, effort)
+        if other is None or (result is not None and result.mean_square < other.mean_square):
+            return result
+        return other
 
     def _keep(self, candidate: Candidate, model: ValidatedModel) -> None:
         if candidate in self.fits and model.cost >= self.fits[candidate].cost:
@@ -288,7 +294,8 @@ class Pool:
         linear = np.clip(linear, least, most)
         model = self._fit_starts(candidate, linear, np.concatenate(values))
         # Priors weigh as in the regression: a free run may begin far off with right parameters.
-        return Begin(model, max(1.0, screening.cost / len(stage.target)))
+        level = max(1.0, screening.cost / len(stage.target))
+        return Begin(model, level, level)
 
     def _fit_starts(self, candidate: Candidate, linear: Array, effects: Array) -> CandidateModel:
         """A model with fitted initial states; those of a poorer model compensate its error."""
