@@ -242,25 +242,27 @@ def _with_one_of(
             for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
                 if screening.values and screening.validation_cost <= most():
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
-            _attempt_about_model_file(pool, known, law, other)
+            _attempt_about_model_file(pool, chosen, law, other)
         yield from _converge_candidate(pool, candidate, chosen)
 
 
 def _attempt_about_model_file(
-    pool: Pool, known: Mapping[StrutEffect, Array], law: StrutEffect, other: StrutEffect
+    pool: Pool, chosen: ValidatedModel, law: StrutEffect, other: StrutEffect
 ) -> None:
     """Fit a law that reads the strut's spring, with those parameters that another one has too.
 
     Beside the best linear model's spring it is another law than beside the model file's: that of
     a spring with free play is the spring of play and stroke together.
     """
+    known = law_values(pool.problem, chosen.fit)
     item, own = effect(other[1]), effect(law[1]).named(known[law])
     reads_strut = any(read.origin == "strut" for read in arguments(item.force, item))
     if not reads_strut or not all(p.name in own for p in item.parameters):
         return
     values = {at: those for at, those in known.items() if at != law}
     values[other] = np.array([own[p.name] for p in item.parameters])
-    pool.attempt_at_nominal(nominal(pool.problem).with_effects(*values), values)
+    candidate = nominal(pool.problem).with_effects(*values)
+    pool.attempt_at_nominal(candidate, values, chosen.fit.mean_square)
 
 
 def _neighbours(problem: Problem, law: StrutEffect) -> list[str]:

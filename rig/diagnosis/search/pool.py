@@ -304,12 +304,18 @@ class Pool:
         result = fit(self.problem, model, none_free, _STARTS, effects=False)
         return model if result is None else result.model
 
-    def attempt_at_nominal(self, candidate: Candidate, laws: Mapping[StrutEffect, Array]) -> None:
-        """Fit laws in simulation, from the linear part of the nominal model on."""
+    def attempt_at_nominal(
+        self, candidate: Candidate, laws: Mapping[StrutEffect, Array], promised: float = np.inf
+    ) -> None:
+        """Fit laws in simulation, from the linear part of the nominal model on.
+
+        `promised` is as of `Begin`.
+        """
         values = [existing_values(self.problem, nominal(self.problem))]
         values += [laws[law] for law in candidate.new]
         linear = np.array([p.expected for p in self.problem.linear])
-        self.attempt(self._fit_starts(candidate, linear, np.concatenate(values)), FULL)
+        model = self._fit_starts(candidate, linear, np.concatenate(values))
+        self._fit_each([(candidate, partial(Begin, model, promised=promised))], FULL, no_progress)
 
     def adopt(self, result: Fit) -> None:
         """Fit the laws of a model of other recordings, starting from its parameters."""
