@@ -167,7 +167,7 @@ def _least_error_model(
             if search.evidence:
                 search = search.without_laws(problems.learnt, _LESS_WITHOUT)
             evaluations = others
-            search = search._replace(chosen=search.chosen._replace(fit=other))
+            search = search._replace(chosen=search.chosen._replace(fit=other), alike=())
     return search, evaluations
 
 

@@ -55,6 +55,7 @@ from rig.diagnosis.search.fit import (
     effect_variables,
     fit_covariance,
     is_white,
+    spread_over,
 )
 from rig.diagnosis.search.model_selection import SearchResult
 from rig.diagnosis.verdict import HeldOutLaws, confirmation
@@ -146,7 +147,8 @@ def compose_result(
     recordings = range(problem.recordings)
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
-    estimates = FitEstimates(chosen, fit_covariance(chosen))
+    covariance = fit_covariance(chosen).wider_by(spread_over(problem, chosen, search.alike))
+    estimates = FitEstimates(chosen, covariance)
     corrected = spec_with_corrections(problem, chosen.model)
     held_out = _held_out(evaluations, by_blocks=by_blocks)
     others = _other_families(search) if verdict in ("ambiguous", "partly_explained") else ()

@@ -12,7 +12,7 @@ References:
 
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import NamedTuple
@@ -400,6 +400,10 @@ class FitCovariance(NamedTuple):
         """Half-widths of the search variables' intervals, shape (k,)."""
         return self.factor * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    def wider_by(self, covariance: Array) -> "FitCovariance":
+        """With a further covariance (k, k) from another source."""
+        return self._replace(covariance=self.covariance + covariance)
+
 
 @np.errstate(over="ignore", invalid="ignore")
 def fit_covariance(result: Fit) -> FitCovariance:
@@ -427,6 +431,25 @@ def fit_covariance(result: Fit) -> FitCovariance:
     stretch = np.sqrt(np.maximum(ratio, 1.0))
     covariance = robust * np.outer(stretch, stretch) / np.outer(size, size)
     return FitCovariance(covariance, float(student.ppf(0.975, max(count - 1, 2))))
+
+
+def spread_over(problem: Problem, result: Fit, alike: Sequence[Fit]) -> Array:
+    """Covariance (k, k) of a fit's search variables over models that are as likely.
+
+    It is taken about the first of them, which has the same parameters; zero where there are none.
+    """
+    count, slots = int(result.free.sum()), slots_of(problem, result.candidate).each
+    size = len(result.solution.values)
+
+    def variables_of(model: Fit) -> Array:
+        values = result.solution.values.copy()
+        values[:count] = model.parts.linear[result.free]
+        for row, variables in effect_variables(problem, result).items():
+            values[variables] = model.parts.effects[slots[row].parameters]
+        return result.space.inner(values)
+
+    changes = [variables_of(other) - variables_of(alike[0]) for other in alike[1:]]
+    return sum((np.outer(c, c) / len(alike) for c in changes), np.zeros((size, size)))
 
 
 def effect_variables(problem: Problem, result: Fit) -> dict[int, Integers]:

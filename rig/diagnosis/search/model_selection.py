@@ -45,6 +45,9 @@ _GENERAL = 2
 _MORE_FITS, _STILL_FALLING = 3, 0.95
 """Fits of a simpler model in addition, as long as each reduces its cost by a twentieth."""
 _BY_CHANCE = "chance gains as much on blocks left out of the fit, at a level of {:g}"
+_TIED, _MOST_TIED = 4.0, 3
+"""Statistic up to which two sets of corrections are as likely (two standard deviations), and how
+many other sets are fitted."""
 _ALIKE = 0.01
 """Difference of two shares up to which they count as one, however narrow their intervals."""
 
@@ -62,6 +65,8 @@ class SearchResult(NamedTuple):
         evidence: Gains by each law of the chosen model on blocks left out of fits.
         gain_alike: Whether a gain of the applied force replaces mass, stiffness and damping, or two
             of them, that changed in one proportion.
+        alike: The chosen model, followed by models with another correction for one of its own that
+            the data cannot distinguish from it; empty where there are none.
     """
 
     given: Fit
@@ -74,6 +79,7 @@ class SearchResult(NamedTuple):
     left: float | None
     evidence: Mapping[StrutEffect, LeftOutGains]
     gain_alike: bool
+    alike: tuple[Fit, ...]
 
     def without_laws(self, problem: Problem, why: str) -> "SearchResult":
         """The result with the laws taken back, for a reason that held-out data give."""
@@ -87,6 +93,7 @@ class SearchResult(NamedTuple):
             rejected=(*back, *self.rejected),
             left=None,
             evidence={},
+            alike=(),
         )
 
 
@@ -100,7 +107,7 @@ def select_model(
     while True:
         best = pool.chosen(most_laws)
         chosen = _without_superfluous_laws(pool, best, progress)
-        final, alike = _with_few_corrections(pool, chosen)
+        final, full, is_gain = _with_few_corrections(pool, chosen)
         why = find_unidentifiable_law(pool.problem, final.fit) if final.size else None
         if why is not None:
             pool.reject(chosen.fit.candidate, why)
@@ -120,13 +127,14 @@ def select_model(
     progress("comparing rivals", 0.9)
     rivals = _rivals(pool, chosen) or _rivals_of_one_frequency(pool, final)
     superfluous = _superfluous_effects(pool, chosen)
-    lawless = _with_few_corrections(pool, pool.linear)[0] if final.size else final
+    lawless = _with_few_corrections(pool, pool.linear).model if final.size else final
+    alike = () if is_gain else _with_other_corrections(pool, full, final.fit)
     if first_round is not None:
         rejected = list_rejections(pool, first, first_round, final, rivals)
     left = residual_left(pool, final) if final.size else None
     return SearchResult(
         pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, left, evidence,
-        alike,
+        is_gain, alike,
     )  # fmt: skip
 
 
@@ -433,11 +441,21 @@ def _with_memory_instead(
 # --- insignificant linear corrections ---------------------------------------------------------
 
 
-def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> tuple[ValidatedModel, bool]:
-    """The chosen model, converged, with significant linear corrections alone.
+class _FewCorrections(NamedTuple):
+    """A model with significant linear corrections alone.
 
-    Also whether a gain of the applied force replaces other corrections.
+    Attributes:
+        full: The fit with all corrections.
+        is_gain: Whether a gain of the applied force replaces other corrections.
     """
+
+    model: ValidatedModel
+    full: Fit
+    is_gain: bool
+
+
+def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections:
+    """The chosen model, converged, with significant linear corrections alone."""
     problem = pool.problem
     converged = fit(problem, chosen.fit.model, chosen.fit.free, FINAL)
     if converged is not None:
@@ -445,18 +463,20 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> tuple[Validated
     result = _with_significant_corrections(pool, chosen)
     if not result.size and not pool.prefers(result, as_given := pool.validate(pool.given)):
         # Corrections that differ from zero and change nothing that can be measured.
-        return as_given, False
+        return _FewCorrections(as_given, chosen.fit, is_gain=False)
     gain = _corrections_as_gain(problem, result.fit)
+    without_gain = _FewCorrections(result, chosen.fit, is_gain=False)
     if gain is None:
-        return result, False
+        return without_gain
     linear, free = gain
     if _contradicts_prior(problem, result.fit.parts.linear, linear, pool.criteria.significant):
-        return result, False
+        return without_gain
     first = CandidateModel(chosen.fit.candidate, result.fit.parts._replace(linear=linear))
     refitted = fit(problem, first, free)
     if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
-        return _with_significant_corrections(pool, lean), True
-    return result, False
+        model = _with_significant_corrections(pool, lean)
+        return _FewCorrections(model, chosen.fit, is_gain=True)
+    return without_gain
 
 
 def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
@@ -471,6 +491,51 @@ def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> Validat
     if fewer is not None and not pool.prefers(chosen, lean := pool.validate(fewer)):
         return lean
     return chosen
+
+
+def _with_other_corrections(pool: Pool, full: Fit, lean: Fit) -> tuple[Fit, ...]:
+    """A model with another correction in place of one of its own, where the data cannot say which.
+
+    A stiffness may be replaced by a free length if a law is about that. What follows for the laws
+    belongs to their uncertainty: which corrections are significant was chosen by the same data.
+    `full` is the model with all corrections.
+    """
+    fits: list[Fit] = []
+    for free in _tied_corrections(full, lean.free):
+        linear = np.where(free, full.parts.linear, 0.0)
+        first = CandidateModel(lean.candidate, lean.parts._replace(linear=linear))
+        other = fit(pool.problem, first, free, FINAL)
+        if (
+            other is not None
+            and other.solution.cost < lean.solution.cost + _TIED * lean.solution.level
+        ):
+            fits.append(other)
+    return (lean, *fits) if fits else ()
+
+
+def _tied_corrections(full: Fit, kept: Flags) -> list[Flags]:
+    """Sets with another correction for one that is kept, and as small a loss; best first.
+
+    The loss is Wald's statistic of what is left out, each kept set of shape (L,).
+    """
+    variables = np.flatnonzero(full.free)
+    count = len(variables)
+    covariance = fit_covariance(full).covariance[:count, :count]
+    x = full.space.inner(full.solution.values)[:count]
+
+    def loss(free: Flags) -> float:
+        out = np.flatnonzero(~free[variables])
+        return float(x[out] @ np.linalg.pinv(covariance[np.ix_(out, out)]) @ x[out])
+
+    most = loss(kept) + _TIED
+    tied: list[tuple[float, int, Flags]] = []
+    for i in np.flatnonzero(kept & full.free).tolist():
+        for j in np.flatnonzero(full.free & ~kept).tolist():
+            other = kept.copy()
+            other[i], other[j] = False, True
+            if (other_loss := loss(other)) < most:
+                tied.append((other_loss, len(tied), other))
+    return [flags for _, _, flags in sorted(tied)[:_MOST_TIED]]
 
 
 def _significant_parameters(result: Fit, significant: float) -> Flags:
