@@ -1,4 +1,4 @@
-"""Corrections of the linear part that the data cannot distinguish, and what they add to intervals."""
+"""Corrections of the linear part that tie, and what they add to intervals."""
 
 import numpy as np
 import pytest
