@@ -1,6 +1,7 @@
 """Fills a slot, diagnoses it as `rig diagnose` does, and keeps the result."""
 
 import json
+import math
 import shutil
 import signal
 import time
@@ -9,23 +10,26 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
-from dart_model.spec import load_model
+from dart_model.spec import ModelSpec, load_model
 from rig.diagnosis.diagnose import diagnose as rig_diagnose
 from rig.diagnosis.outcome import to_json
 from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
+from tests.diagnosis_benchmark.live import live_innovation
 from tests.diagnosis_benchmark.moving import MovingCase, write_moving
 from tests.diagnosis_benchmark.plan import Slot, fill, ratios_of
 from tests.truth.files import write_case
+from tests.truth.plant import Case
 
 
-def diagnose(folder: Path) -> dict:
+def diagnose(folder: Path) -> tuple[dict, ModelSpec | None]:
     """Diagnose a case's files through the same functions as ``rig diagnose``.
 
     Returns:
-        What ``diagnosis.json`` holds; where the data were refused, the verdict ``failed``.
+        What ``diagnosis.json`` holds, and the corrected model; where the data were refused, the
+        verdict ``failed``, and none.
     """
     model = load_model(folder / "model.yaml")
     try:
@@ -35,8 +39,22 @@ def diagnose(folder: Path) -> dict:
             held_out=[read_recording(folder / "test.csv")],
         )
     except RecordingError as error:
-        return failed(str(error))
-    return json.loads(to_json(found.diagnosis))
+        return failed(str(error)), None
+    return json.loads(to_json(found.diagnosis)), found.corrected
+
+
+def _follow(
+    case: Case | MovingCase, corrected: ModelSpec | None, diagnosis: dict, folder: Path
+) -> float:
+    """How a corrected model follows the held-out run, as `Result.live_innovation`."""
+    if corrected is None or isinstance(case, MovingCase) or case.is_dyno:
+        return math.nan
+    return live_innovation(
+        corrected,
+        read_recording(folder / "test.csv"),
+        case.sensors.height_noise_m,
+        diagnosis["held_out"]["residual_force_rmse_n"]["after"],
+    )
 
 
 def failed(message: str) -> dict:
@@ -61,7 +79,7 @@ def crashed(slot: Slot, error: BaseException) -> Result:
     """The result of a slot whose diagnosis broke off."""
     case = fill(slot)
     judged = judge(case, (), failed(repr(error)), slot.name, slot.group)
-    return Result(**judged, duration_s=float("nan"))
+    return Result(**judged, duration_s=math.nan, live_innovation=math.nan)
 
 
 @contextmanager
@@ -96,10 +114,11 @@ def execute(slot: Slot, out: Path, limit_s: float) -> Result:
     ratios = ratios_of(case)
     started = time.perf_counter()
     with within(limit_s):
-        diagnosis = diagnose(folder)
+        diagnosis, corrected = diagnose(folder)
     duration_s = time.perf_counter() - started
+    live = _follow(case, corrected, diagnosis, folder)
     judged = judge(case, ratios, diagnosis, slot.name, slot.group)
-    result = Result(**judged, duration_s=duration_s)
+    result = Result(**judged, duration_s=duration_s, live_innovation=live)
     if result.verdict == "failed":
         return result
     kept.parent.mkdir(parents=True, exist_ok=True)

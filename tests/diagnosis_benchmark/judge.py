@@ -19,6 +19,9 @@ from tests.truth.simulation import height_floor_m
 
 NAMES_A_CAUSE = frozenset({"explained", "partly_explained", "ambiguous"})
 NO_CAUSE = "restoring_surface"
+LIVE_MULTIPLE = 3.0
+"""Times the noise that a right model's innovation may be: a force that is held for a tick adds to
+it where the noise is small."""
 SIDE_EFFECTS = {"stiffness": frozenset({"preload"})}
 """Linear family -> what a correction of it brings along: stiffness is about the free length in the
 file, and about mid-stroke in a diagnosis, where its change is a preload as well."""
@@ -54,6 +57,9 @@ class Result:
         intervals: Parameters that the truth can be held against.
         overlaps: Of where stops and knees show with where they were planted (F1).
         duration_s: Wall time of the diagnosis.
+        live_innovation: RMS innovation of the corrected model over the noise of the height, while
+            it follows the held-out run with tuned gains; infinite where the loop is unstable or a
+            force is not finite; NaN with a base that is moved.
         message: What went wrong, if it failed.
     """
 
@@ -81,7 +87,14 @@ class Result:
     intervals: tuple[Interval, ...]
     overlaps: tuple[float, ...]
     duration_s: float
+    live_innovation: float
     message: str
+
+    @property
+    def runs_live(self) -> bool:
+        """Whether the corrected model runs, and leaves noise alone where all is explained."""
+        is_complete = self.verdict in {"explained", "ambiguous", "nothing_missing"}
+        return self.live_innovation < (LIVE_MULTIPLE if is_complete else math.inf)
 
     @property
     def floor_multiple(self) -> float:
@@ -196,7 +209,7 @@ def _errors(case: Case | MovingCase, diagnosis: dict) -> dict[str, str | float]:
 def judge(
     case: Case | MovingCase, ratios: tuple[float, ...], diagnosis: dict, slot: str, group: str
 ) -> dict:
-    """All of a `Result` but its duration, as its fields."""
+    """All of a `Result` but its duration and how it runs live, as its fields."""
     found = diagnosis["effects"]
     is_moving = isinstance(case, MovingCase)
     is_rough = is_moving or not case.roughness.is_exact

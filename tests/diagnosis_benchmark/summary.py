@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from tests.diagnosis_benchmark.judge import Result
+from tests.diagnosis_benchmark.judge import LIVE_MULTIPLE, Result
 from tests.diagnosis_benchmark.plan import GROUPS
 from tests.evidence import command_line, write_evidence
 from tests.evidence import table as markdown_table
@@ -82,7 +82,10 @@ Each share is given with its 95 % Wilson interval. The intervals of parameters a
 cases that are right. A case may have several of them; the Wilson interval of their share assumes
 that they are independent, and may be too narrow. *F1 of the range in which it acts* is the overlap
 of the stroke in which a stop shows, and of the speeds at which a knee does, with those at which
-they were planted (twice what is common over the sum of both). The durations depend on the load of
+they were planted (twice what is common over the sum of both). *Runs live* is the share of corrected
+models that follow the held-out run tick by tick at its rate, with the gains that `rig tune` finds
+for them: the loop is stable, no force is infinite, and where all is explained the RMS innovation is
+at most {LIVE_MULTIPLE:g} times the noise. The durations depend on the load of
 the machine, which is stated at the end of the page.
 """
 
@@ -157,6 +160,7 @@ def figures(results: list[Result]) -> dict[str, object]:
         "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
         "explained_worst": _percentile(explained, 100),
         "coverage": rate(interval.holds for interval in held),
+        "runs_live": rate(r.runs_live for r in results if not math.isnan(r.live_innovation)),
         "overlaps": len(overlaps),
         "overlap_mean": float(np.mean(overlaps)) if overlaps else None,
         "verdicts": dict(Counter(result.verdict for result in results)),
@@ -250,6 +254,7 @@ COLUMNS = (
     Column(f"`explained` within {EXPLAINED_MULTIPLE} noise floors", _explained),
     Column("95 % intervals that contain the truth", lambda found: f"{found['coverage']}"),
     Column("mean F1 of the range in which it acts", _decimal("overlap_mean", ".2f")),
+    Column("runs live", lambda found: str(found["runs_live"])),
     Column("median duration, s", _decimal("seconds_median", ".1f")),
     Column("longest duration, s", _decimal("seconds_worst", ".1f")),
 )

@@ -1,11 +1,13 @@
 """The benchmark counts what it says it counts."""
 
 import json
+import math
 
 import pytest
 from rich.console import Console
 
 from dart_model.effects import effect
+from tests.diagnosis import little_bench
 from tests.diagnosis_benchmark import __main__ as command
 from tests.diagnosis_benchmark import execute as execution
 from tests.diagnosis_benchmark.acting import overlap, overlaps
@@ -20,6 +22,7 @@ from tests.diagnosis_benchmark.execute import (
     within,
 )
 from tests.diagnosis_benchmark.judge import Result, false_names, is_right, is_unbound, judge
+from tests.diagnosis_benchmark.live import live_innovation
 from tests.diagnosis_benchmark.plan import GROUPS, Slot, fill, part_of, slots
 from tests.diagnosis_benchmark.summary import (
     COLUMNS,
@@ -38,6 +41,7 @@ from tests.truth.plant import Bench, Case, Excitation, Planted, Roughness, RunPl
 BENCH = Bench(10.0, 1000.0, 20.0, 0.5)
 LOAD = RunPlan(Excitation("multisine", 1.0, 0.0, 1.0, 4.0, 0.5, 1.0, 0), 0.0, 20.0, 0)
 STROKE = RunPlan(Stroke(0.05, 0.5, 0.5, 4.0, 1.0, 1.0, 0), 0.0, 20.0, 0)
+TIMES = {"duration_s": 1.0, "live_innovation": 1.0}
 BOUNDED = {"value": 1.0, "low": 0.9, "high": 1.1}
 OPEN = {"value": 1.0, "low": None, "high": 1.1}
 NOTHING = {"value": 0.1, "low": -0.1, "high": 0.3}
@@ -304,10 +308,8 @@ def test_results_are_kept_and_tabulated(tmp_path, monkeypatch):
         noise = truth["sensors"]["height_noise_m"]
         rmse = {"before": 50 * noise, "after": 1.1 * noise}
         answer = diagnosis("explained", *truth["families"])
-        return answer | {
-            "held_out": {"height_rmse_m": rmse},
-            "noise_floor": {"height_rmse_m": noise},
-        }
+        found = {"held_out": {"height_rmse_m": rmse}, "noise_floor": {"height_rmse_m": noise}}
+        return answer | found, None
 
     monkeypatch.setattr(execution, "diagnose", oracle)
     slot = Slot("single", "preload", 0, 0)
@@ -341,7 +343,7 @@ def test_dyno_is_judged_by_its_load_cell():
         "held_out": {"height_rmse_m": None, "strut_force_rmse_n": force},
         "noise_floor": {"height_rmse_m": None, "residual_force_rmse_n": 0.5},
     }
-    result = Result(**judge(case, (), answer, "slot", "dyno_complete"), duration_s=1.0)
+    result = Result(**judge(case, (), answer, "slot", "dyno_complete"), **TIMES)
     assert (result.unit, result.error_before) == ("N", 9.0)
     assert result.floor_multiple == pytest.approx(1.1)
 
@@ -350,7 +352,7 @@ def fake_results(count, wrong):
     answers = [diagnosis("nothing_missing")] * (count - wrong)
     answers += [diagnosis("explained", "stop")] * wrong
     return [
-        Result(**judge(case_of(), (), answer, "slot", "complete"), duration_s=2.0)
+        Result(**judge(case_of(), (), answer, "slot", "complete"), **TIMES | {"duration_s": 2.0})
         for answer in answers
     ]
 
@@ -381,7 +383,7 @@ def test_tables_of_nothing_are_tables():
 
 
 def test_failure_is_reported_and_tried_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(execution, "diagnose", lambda _: failed("it broke"))
+    monkeypatch.setattr(execution, "diagnose", lambda _: (failed("it broke"), None))
     slot = Slot("complete", "complete", 0, 0)
     result = execute(slot, tmp_path, 60.0)
     assert (result.verdict, result.right, result.message) == ("failed", False, "it broke")
@@ -427,3 +429,29 @@ def test_a_stop_and_a_knee_are_held_against_where_they_were_planted():
     assert list(overlaps(case, {"effects": named})) == pytest.approx([1.0, 1.0])
     assert list(overlaps(case, {"effects": named[:1]})) == pytest.approx([1.0])
     assert not list(overlaps(case, {"effects": []}))
+
+
+def test_a_corrected_model_that_explains_all_leaves_noise_alone_live():
+    results = [
+        Result(**judge(case_of(), (), diagnosis(verdict), "slot", "complete"), duration_s=1.0,
+               live_innovation=innovation)
+        for verdict, innovation in (
+            ("nothing_missing", 1.0), ("nothing_missing", 9.0), ("partly_explained", 9.0),
+            ("partly_explained", math.inf), ("partly_explained", math.nan),
+        )
+    ]  # fmt: skip
+    shown = figures(results)["runs_live"]
+    assert (shown.hits, shown.of) == (2, 4)
+
+
+@pytest.mark.slow
+def test_a_model_follows_its_bench_and_another_does_not():
+    """Noise alone where the model is right; with half of its spring more than noise."""
+    noise_m = 1e-5
+    recording = little_bench.run(little_bench.Nothing(), noise_m=noise_m)
+    right, wrong = (
+        live_innovation(little_bench.model(stiffness=stiffness), recording, noise_m, force_n)
+        for stiffness, force_n in ((little_bench.STIFFNESS, 0.1), (1250.0, 20.0))
+    )
+    assert right < 2.0  # The applied force is held for a tick.
+    assert wrong > 5.0

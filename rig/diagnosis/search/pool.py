@@ -470,9 +470,16 @@ class Pool:
         return is_right and not self.is_near(smaller, larger)
 
     def adds_dry_friction(self, smaller: ValidatedModel, larger: ValidatedModel) -> bool:
-        """Whether friction alone is added, and acts where a damper hardly does: at low velocity."""
+        """Whether friction alone is added, and acts where a damper hardly does: at low velocity.
+
+        Beside friction or hysteresis, which act there themselves, it corrects their formula.
+        """
         few, many = Counter(smaller.families), Counter(larger.families)
-        if many - few != Counter(["friction"]) or few - many or "friction" in few:
+        if (
+            many - few != Counter(["friction"])
+            or few - many
+            or {"friction", "hysteresis"} & set(few)
+        ):
             return False
         (row,) = (row for row, name in new_laws(larger.fit) if effect(name).family == "friction")
         strut, force = forces_along(self.problem, larger.fit.model, self.along)[row]

@@ -1,0 +1,83 @@
+"""A corrected model at a run's rate: it follows the recording that was not learnt from."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from can_dbc.errors import InputError
+from dart_model.plant import DartPlant
+from dart_model.spec import ModelSpec
+from rig.bridge.values import StepInput
+from rig.channels.channel import Sample
+from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
+from rig.closed_loop.loop import SampleTiming
+from rig.closed_loop.poles import OperatingPoint
+from rig.closed_loop.strut_response import FAST_SPEED_M_PER_S, linearise_at
+from rig.recordings.recording import Recording
+from rig.tuning.expectation import expectation_from_noise
+from rig.tuning.gains import Aim, TuningProblem, tune_observer
+from tests.bridge.cores import GAINS, bench_sample, channels, supervised
+
+LIMIT_N = 5000.0
+UP_TO_HZ = 20.0
+"""Frequency up to which a model's remaining force is expected."""
+SETTLED = 0.5
+"""Share of the recording from which on the innovation counts."""
+
+
+def live_innovation(
+    spec: ModelSpec, recording: Recording, noise_m: float, residual_n: float
+) -> float:
+    """RMS innovation over the noise of the height, of a model of one strut with tuned gains.
+
+    The model follows the recording tick by tick. Infinite where no gains make the loop stable, or a
+    force is not finite.
+
+    Args:
+        noise_m: Standard deviation of the height's noise.
+        residual_n: RMS of the force that the model leaves.
+    """
+    plant = DartPlant(spec)
+    period_ns = round(1e9 * float(np.median(np.diff(recording.t_s))))
+    rest_m = [float(np.nanmean(recording.heights_m[:, 0]))]
+    problem = TuningProblem(
+        plant,
+        (GAINS,),
+        0,
+        linearise_at(plant, rest_m),
+        rest_m,
+        SampleTiming(period_ns),
+        expectation_from_noise(noise_m, residual_n, UP_TO_HZ),
+        LIMIT_N,
+        [OperatingPoint(rest_m, FAST_SPEED_M_PER_S)],
+    )
+    try:
+        tuned = tune_observer(problem, "kalman", Aim())
+    except InputError:
+        return math.inf
+    if tuned.gain_margin <= 1.0 or tuned.in_motion <= 0.0:
+        return math.inf
+    rig = supervised(plant, (tuned.observer,), bench=channels(1, interval_ns=period_ns))
+    state, innovations_m, forces_n = rig.init(0), list[float](), list[float]()
+    for step_input in _inputs(recording, period_ns):
+        state, output, _ = rig.step(state, step_input)
+        innovations_m += [strut.innovation_m for strut in output.struts]
+        forces_n += [strut.force_n for strut in output.struts]
+    if not forces_n or not np.all(np.isfinite(forces_n)):
+        return math.inf
+    late = np.array(innovations_m)[round(SETTLED * len(innovations_m)) :]
+    return float(np.sqrt(np.nanmean(late**2))) / noise_m
+
+
+def _inputs(recording: Recording, period_ns: int) -> Iterator[StepInput]:
+    further = ((APPLIED_FORCE, recording.applied_force_n), (TEMPERATURE, recording.temperature_c))
+    for tick, height_m in enumerate(recording.heights_m[:, 0].tolist()):
+        t_ns = tick * period_ns
+        samples = [] if math.isnan(height_m) else [Sample(0, height_m, t_ns)]
+        samples += [
+            bench_sample(1, quantity, float(values[tick]), t_ns)
+            for quantity, values in further
+            if values is not None and math.isfinite(values[tick])
+        ]
+        yield StepInput(t_ns, tuple(samples))
