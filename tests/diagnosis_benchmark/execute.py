@@ -45,10 +45,10 @@ def diagnose(folder: Path) -> tuple[dict, ModelSpec | None]:
 
 def _follow(
     case: Case | MovingCase, corrected: ModelSpec | None, diagnosis: dict, folder: Path
-) -> float:
+) -> float | None:
     """How a corrected model follows the held-out run, as `Result.live_innovation`."""
     if corrected is None or isinstance(case, MovingCase) or case.is_dyno:
-        return math.nan
+        return None
     return live_innovation(
         corrected,
         read_recording(folder / "test.csv"),
@@ -79,7 +79,7 @@ def crashed(slot: Slot, error: BaseException) -> Result:
     """The result of a slot whose diagnosis broke off."""
     case = fill(slot)
     judged = judge(case, (), failed(repr(error)), slot.name, slot.group)
-    return Result(**judged, duration_s=math.nan, live_innovation=math.nan)
+    return Result(**judged, duration_s=math.nan, live_innovation=None)
 
 
 @contextmanager

@@ -59,7 +59,7 @@ class Result:
         duration_s: Wall time of the diagnosis.
         live_innovation: RMS innovation of the corrected model over the noise of the height, while
             it follows the held-out run with tuned gains; infinite where the loop is unstable or a
-            force is not finite; NaN with a base that is moved.
+            force is not finite; None on a dyno and with a base that is moved.
         message: What went wrong, if it failed.
     """
 
@@ -87,14 +87,15 @@ class Result:
     intervals: tuple[Interval, ...]
     overlaps: tuple[float, ...]
     duration_s: float
-    live_innovation: float
+    live_innovation: float | None
     message: str
 
     @property
     def runs_live(self) -> bool:
         """Whether the corrected model runs, and leaves noise alone where all is explained."""
         is_complete = self.verdict in {"explained", "ambiguous", "nothing_missing"}
-        return self.live_innovation < (LIVE_MULTIPLE if is_complete else math.inf)
+        most = LIVE_MULTIPLE if is_complete else math.inf
+        return self.live_innovation is not None and self.live_innovation < most
 
     @property
     def floor_multiple(self) -> float:

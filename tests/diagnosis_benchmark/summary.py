@@ -160,7 +160,7 @@ def figures(results: list[Result]) -> dict[str, object]:
         "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
         "explained_worst": _percentile(explained, 100),
         "coverage": rate(interval.holds for interval in held),
-        "runs_live": rate(r.runs_live for r in results if not math.isnan(r.live_innovation)),
+        "runs_live": rate(r.runs_live for r in results if r.live_innovation is not None),
         "overlaps": len(overlaps),
         "overlap_mean": float(np.mean(overlaps)) if overlaps else None,
         "verdicts": dict(Counter(result.verdict for result in results)),

@@ -437,7 +437,7 @@ def test_a_corrected_model_that_explains_all_leaves_noise_alone_live():
                live_innovation=innovation)
         for verdict, innovation in (
             ("nothing_missing", 1.0), ("nothing_missing", 9.0), ("partly_explained", 9.0),
-            ("partly_explained", math.inf), ("partly_explained", math.nan),
+            ("partly_explained", math.inf), ("partly_explained", None),
         )
     ]  # fmt: skip
     shown = figures(results)["runs_live"]
@@ -450,8 +450,13 @@ def test_a_model_follows_its_bench_and_another_does_not():
     noise_m = 1e-5
     recording = little_bench.run(little_bench.Nothing(), noise_m=noise_m)
     right, wrong = (
-        live_innovation(little_bench.model(stiffness=stiffness), recording, noise_m, force_n)
-        for stiffness, force_n in ((little_bench.STIFFNESS, 0.1), (1250.0, 20.0))
+        live_innovation(
+            little_bench.model(stiffness=share * little_bench.STIFFNESS),
+            recording,
+            noise_m,
+            residual_n=0.1,
+        )
+        for share in (1.0, 0.5)
     )
     assert right < 2.0  # The applied force is held for a tick.
     assert wrong > 5.0
