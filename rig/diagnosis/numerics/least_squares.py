@@ -214,7 +214,7 @@ class Exact(NamedTuple):
         with np.errstate(over="ignore", invalid="ignore"):
             columns = columns * np.where(space.low < space.high, units, 0.0)
             moves = _DIFFERENCE * np.linalg.norm(columns, axis=0)
-        parted = ~(moves <= _PARTED * np.linalg.norm(residual))
+            parted = ~(moves <= _PARTED * np.linalg.norm(residual))
         if np.any(parted):
             columns[:, parted] = self.differences.jacobian(x, residual, space, sides)[:, parted]
         return columns

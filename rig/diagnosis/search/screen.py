@@ -502,6 +502,7 @@ def _residual(stage: Stage, laws: Sequence[StrutEffect], values: Sequence[Array]
     return total
 
 
+@np.errstate(over="ignore")  # A column that overflows has no direction, and becomes zero.
 def _law_tangents(stage: Stage, base: Screening) -> Array:
     """Derivatives of the response by the parameters of a combination's laws, shape (m, k)."""
     columns: list[Array] = []
