@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml` · what recordings can "
-    "determine: `rig check runs/7 more.csv --model model.yaml`"
+    "determine: `rig check runs/7 more.csv --model model.yaml` · what to record in addition: "
+    "`rig check runs/7 --model model.yaml --excitation next.csv`"
 )
 
 
@@ -45,6 +46,14 @@ def check_command(
             "model.",
         ),
     ] = None,
+    excitation: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="With --model: write an excitation (CSV) that shows what the recordings leave "
+            "open, within their stroke.",
+        ),
+    ] = None,
     out: SummaryFolder = None,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
@@ -55,11 +64,16 @@ def check_command(
 
     With --model, recordings are checked before they are diagnosed: stroke, speeds, frequencies,
     noise; which linear parameters and which families of laws they can determine; what to record in
-    addition. The bounds are those of a right model: a diagnosis does no better.
+    addition. The bounds are those of a right model: a diagnosis does no better. With --excitation
+    this is planned: slow cycles, a sweep through the resonance and a multisine, of a bench of one
+    strut; the force is that of the model, so the bench moves as planned as far as the model is
+    right. Check it against the limits of your bench before you run it.
     """
     if model is not None:
-        _check_recordings(paths, model, out, as_json=as_json, junit=junit)
+        _check_recordings(paths, model, excitation, out, as_json=as_json, junit=junit)
         return
+    if excitation is not None:
+        raise InputError(f"--excitation {excitation}: expected recordings and --model MODEL, too")
     if len(paths) > 1:
         raise InputError(
             f"{paths[1]}: expected one configuration, or recordings with --model MODEL"
@@ -70,16 +84,28 @@ def check_command(
 
 
 def _check_recordings(
-    paths: "Sequence[Path]", model: str, out: Path | None, *, as_json: bool, junit: Path | None
+    paths: "Sequence[Path]",
+    model: str,
+    excitation: Path | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+    junit: Path | None,
 ) -> None:
     from dart_model.spec import load_named_model
     from rig.diagnosis.determinable import find_determinable
+    from rig.diagnosis.excitation import plan_excitation
+    from rig.formats.excitation_table import write_excitation
     from rig.pages import determinable_tables as texts
     from rig.recordings.read import read_recording
 
     spec = load_named_model(model, Path())
     names = [strut.name for strut in spec.struts]
-    found = find_determinable(spec, [read_recording(path, names) for path in paths])
+    recordings = [read_recording(path, names) for path in paths]
+    planned = None if excitation is None else plan_excitation(spec, recordings)
+    found = find_determinable(spec, recordings)
+    if planned is not None and excitation is not None:
+        write_excitation(planned.t_s, planned.column, planned.values, excitation)
     warnings = texts.warnings(found)
     summary: dict[str, object] = {"schema": 1, **asdict(found), "warnings": warnings}
     if as_json:
@@ -95,6 +121,12 @@ def _check_recordings(
             print_text(f"- {text}", "yellow")
         if not warnings:
             print_text("These recordings determine the linear part and all families.", "green")
+        if planned is not None:
+            stroke = f"{1e3 * planned.heights_m.min():.1f} to {1e3 * planned.heights_m.max():.1f}"
+            print_text(
+                f"Written: {excitation}, {planned.t_s[-1]:.0f} s of {planned.column}, planned for "
+                f"{stroke} mm. On a simulated bench: `components: [{{kind: file, path: FILE}}]`"
+            )
         runs = " ".join(str(path) for path in paths)
         print_text(f"Next: `rig diagnose {runs} --model {model} --out found`")
     write_summary(out, summary)

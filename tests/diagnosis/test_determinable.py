@@ -152,3 +152,10 @@ def test_the_command_states_it_and_refuses_what_it_cannot_read(monkeypatch, tmp_
     assert "is a recording" in capsys.readouterr().err
     assert rig(monkeypatch, "check", model, model) == 2
     assert "expected one configuration" in capsys.readouterr().err
+    planned = tmp_path / "next.csv"
+    assert rig(monkeypatch, "check", path, "--model", model, "--excitation", planned) == 0
+    assert planned.read_text("utf-8").startswith("t_s,applied_force_n\n")
+    assert rig(monkeypatch, "check", path, "--model", model, "--excitation", planned) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert rig(monkeypatch, "check", model, "--excitation", planned) == 2
+    assert "expected recordings and --model" in capsys.readouterr().err
