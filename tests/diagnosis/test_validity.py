@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rig.diagnosis.problem.grid import Track
-from rig.diagnosis.problem.problem import Candidate, LinearParameter, Parts
+from rig.diagnosis.problem.problem import LinearParameter
 from rig.diagnosis.search import validity
 from rig.diagnosis.search.criteria import CRITERIA
 
@@ -39,9 +39,9 @@ DAMPING = LinearParameter(0, "damping", 100.0, 40.0, -100.0)
 
 def reason(changes, law, lawless=(0.0, 0.0, 0.0)):
     problem = SimpleNamespace(linear=(MASS, STIFFNESS, DAMPING))
-    candidate = Candidate((), ((0, law),))
-    result = SimpleNamespace(candidate=candidate, parts=Parts(np.array(changes), np.zeros(1), ()))
-    return validity._find_improbable_linear_part(problem, result, np.array(lawless), CRITERIA)
+    return validity.find_improbable_linear_part(
+        problem, [(0, law)], np.array(changes), np.array(lawless), CRITERIA
+    )
 
 
 def test_laws_that_need_an_improbable_mass_are_not_believed():
