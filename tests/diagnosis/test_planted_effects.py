@@ -361,3 +361,20 @@ def test_a_correction_beyond_the_stated_tolerance_is_noted():
             if "stiffness_n_per_m is" in note
         ] or [""]
         assert ("times the standard deviation" in note) is is_noted
+
+
+class GainAndFriction(Nothing):
+    gain, fine = 1.08, 20
+
+    def force(self, t, z, v, state):
+        return -6.0 * math.tanh(v / 3e-3)
+
+
+@pytest.mark.slow
+def test_a_gain_beside_a_law_is_one_correction_and_not_three():
+    """Mass, stiffness and damping in one proportion, and the law's force with them."""
+    runs = [bench.run(GainAndFriction(), seed=seed) for seed in (1, 2)]
+    found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
+    assert [item.parameter for item in found.linear] == ["input_gain"]
+    assert found.linear[0].total.value == pytest.approx(1.08, rel=1e-3)
+    assert [effect.family for effect in found.effects] == ["friction"]

@@ -16,9 +16,12 @@ from rig.diagnosis.problem.channel_delays import is_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
+    LinearParameter,
     Problem,
     StrutEffect,
+    mid_stroke_m,
     nominal,
+    strut_constants,
 )
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
@@ -32,6 +35,7 @@ from rig.diagnosis.search.screen import (
     no_law,
     rank_laws,
     refine,
+    scale_law,
 )
 from rig.diagnosis.search.validity import find_unidentifiable_law
 
@@ -471,7 +475,17 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
     linear, free = gain
     if _contradicts_prior(problem, result.fit.parts.linear, linear, pool.criteria.significant):
         return without_gain
-    first = CandidateModel(chosen.fit.candidate, result.fit.parts._replace(linear=linear))
+    # All forces were in the wrong proportion to the applied one: the laws', too.
+    laws = {
+        law: scale_law(law[1], values, 1.0 + float(linear[_gain_index(problem)]))
+        for law, values in law_values(problem, result.fit).items()
+    }
+    scaled = {law: values for law, values in laws.items() if values is not None}
+    if len(scaled) < len(laws):
+        return without_gain
+    bare = Candidate(chosen.fit.candidate.kept, ())
+    first = model_for(problem, result.fit.model, bare).with_linear(linear)
+    first = model_for(problem, first, chosen.fit.candidate, {**scaled})
     refitted = fit(problem, first, free)
     if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
         model = _with_significant_corrections(pool, lean)
@@ -564,6 +578,11 @@ def _significant_parameters(result: Fit, significant: float) -> Flags:
     return needed
 
 
+def _gain_index(problem: Problem) -> int:
+    """Index of the gain of the applied force among the linear parameters."""
+    return next(i for i, p in enumerate(problem.linear) if p.kind == "gain")
+
+
 def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] | None:
     """Fewer corrections, one of which is the gain of the applied force; None where it saves none.
 
@@ -600,10 +619,20 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
         elif i in alike:
             changes[i], free[i] = 0.0, False
         elif p.kind not in ("free_length", "delay", "height_gain"):
-            whole = p.nominal if i in scaled else 0.0
+            whole = p.nominal if i in scaled else _force_at_mid_stroke(problem, p)
             changes[i] = (whole + changes[i]) / (1.0 + share) - whole
             free[i] |= p.kind == "preload"
     return changes, free
+
+
+def _force_at_mid_stroke(problem: Problem, parameter: LinearParameter) -> float:
+    """Force in N of the spring where its stiffness is corrected, for a preload; else zero."""
+    if parameter.kind != "preload":
+        return 0.0
+    constants = strut_constants(problem, np.zeros(len(problem.linear)))
+    free_m, stiffness = constants[parameter.strut, :2]
+    middle_m = mid_stroke_m(problem.motions[parameter.strut])
+    return float(parameter.nominal - stiffness * (middle_m - free_m))
 
 
 def _contradicts_prior(problem: Problem, before: Array, after: Array, significant: float) -> bool:
