@@ -89,8 +89,8 @@ def _lengths(motion: Motion) -> list[Start]:
 
 @moving
 def _plateau_starts(motion: Motion) -> list[Start]:
-    widths = [share * motion.stroke_m for share in (0.02, 0.08, 0.2)]
-    return grid([1.0], motion.heights_m(0.2, 0.35, 0.5, 0.65, 0.8), widths)
+    widths = [share * motion.stroke_m for share in (0.02, 0.08, 0.18)]
+    return grid([1.0], motion.heights_m(0.3, 0.4, 0.5, 0.6, 0.7), widths)
 
 
 def _deepest_m(motion: Motion) -> float:
@@ -233,8 +233,8 @@ PLATEAU_STIFFNESS = _spring(
     excitation="a stroke across both ends of the stiff part",
     reference="Den Hartog, Mechanical Vibrations (1956), 8.3: set-up springs",
     starts=_plateau_starts,
-    # Both knees were reached; with one alone it is a stop.
-    bounds=within(centre_height_m=height(0.05, 0.95), half_width_m=of_stroke(0.002, 0.35)),
+    # Both knees lie within nine tenths of the stroke; with one alone it is a stop.
+    bounds=within(centre_height_m=height(0.25, 0.75), half_width_m=of_stroke(0.002, 0.2)),
     simpler=("linear_stiffness",),
     shown=("plateau_force_n", "centre_height_m"),
 )
