@@ -103,9 +103,10 @@ def _check_recordings(
     names = [strut.name for strut in spec.struts]
     recordings = [read_recording(path, names) for path in paths]
     planned = None if excitation is None else plan_excitation(spec, recordings)
-    found = find_determinable(spec, recordings)
     if planned is not None and excitation is not None:
+        # Before what takes seconds: the file may be there already.
         write_excitation(planned.t_s, planned.column, planned.values, excitation)
+    found = find_determinable(spec, recordings)
     warnings = texts.warnings(found)
     summary: dict[str, object] = {"schema": 1, **asdict(found), "warnings": warnings}
     if as_json:

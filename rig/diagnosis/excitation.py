@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dart_model.plant import DartPlant
 from dart_model.spec import ModelSpec
+from rig.closed_loop.strut_response import linearise_at
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
 from rig.recordings.recording import Recording, RecordingError
@@ -31,6 +32,7 @@ _REACH = 0.7
 _SLOW = 0.1
 """Frequency of the slow cycles, as a share of the resonance: the damper's force is small."""
 _SLOW_CYCLES = 2
+"""The second one shows what repeats: creep and noise do not."""
 _SWEEP = (0.25, 3.0)
 """Ends of the sweep, as shares of the resonance."""
 _SMALLER = 1.0 / 3.0
@@ -44,6 +46,7 @@ _LONGEST_S = 60.0
 _FADE = 0.1
 """Share of a part in which it fades in, and out."""
 _MOST_HZ = 1000.0
+"""Most samples a second: the fastest rate of a bridge on an ordinary Linux."""
 _SAMPLES = 40.0
 """Samples in a cycle of the fastest part, at least."""
 
@@ -134,9 +137,7 @@ def _top_speed(recording: Recording) -> float:
 
 
 def _resonance_hz(plant: DartPlant, spec: ModelSpec, height_m: float) -> float:
-    q = np.array(plant.init([height_m]).positions)
-    here = plant.mechanics(q, np.zeros_like(q))
-    mobility = float((here.struts @ np.linalg.solve(here.mass, here.struts.T))[0, 0])
+    mobility = float(linearise_at(plant, [height_m]).mobility_per_kg[0, 0])
     stiffness = max(spec.struts[0].stiffness_n_per_m, 1e-9)
     return float(np.sqrt(stiffness * mobility)) / (2.0 * np.pi)
 

@@ -12,13 +12,7 @@ from rig.diagnosis.excitation import plan_excitation
 from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
-
-
-class Friction(bench.Nothing):
-    fine = 20
-
-    def force(self, t, z, v, state):
-        return -6.0 * math.tanh(v / 3e-3)
+from tests.diagnosis.test_metamorphic import Friction
 
 
 def one_sine(effect, seed=1):

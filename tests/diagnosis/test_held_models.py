@@ -5,7 +5,7 @@ import pytest
 
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build_without_delays
-from rig.diagnosis.problem.problem import free_linear, nominal
+from rig.diagnosis.problem.problem import free_linear, nominal, rms
 from rig.diagnosis.progress import no_progress
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import fit
@@ -33,10 +33,6 @@ class WidePlay(bench.Nothing):
 def problem_of(effect, damping=bench.DAMPING, **kwargs):
     record = bench.run(effect, noise_m=1e-6, gravity=0.0, **kwargs)
     return build_without_delays(bench.model(gravity=0.0, damping=damping), [record], 32, None)
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0, 3.0])

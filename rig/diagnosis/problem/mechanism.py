@@ -97,6 +97,27 @@ class LinearisedMechanism(NamedTuple):
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
         return solve_nearest(np.swapaxes(jacobian, 1, 2), generalised)
 
+    def about(self, z: Array, w: Array, moved: Array) -> "LinearisedMechanism":
+        """The same mechanism, tabulated about another motion.
+
+        Args:
+            z: Heights of the motion, shape (N, struts).
+            w: Their rates.
+            moved: What moved bodies add to both, shape (N, 2, struts).
+        """
+        repeats = 1 if self.is_tabulated else len(z)
+        m = LinearisedMechanism(*(np.repeat(part, repeats, axis=0) for part in self))
+        q = m.q + solve_nearest(m.jacobian, z - m.heights_m - moved[:, 0])
+        v = solve_nearest(m.jacobian, w - moved[:, 1])
+        bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
+        return m._replace(
+            q=q,
+            v=v,
+            heights_m=m.heights_m + np.einsum("kij,kj->ki", m.jacobian, q - m.q),
+            rates_m_per_s=np.einsum("kij,kj->ki", m.jacobian, v),
+            bias=bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v),
+        )
+
     def held_to(
         self, z: Array, w: Array, moved: Array, rate_rad_per_s: float
     ) -> "LinearisedMechanism":
@@ -105,23 +126,13 @@ class LinearisedMechanism(NamedTuple):
         Critically damped at a rate: they act as the gains of an observer do.
 
         Args:
-            z: Heights of the motion, shape (N, struts).
+            z: Heights of the motion, as of `about`.
             w: Their rates.
-            moved: What moved bodies add to both, shape (N, 2, struts).
+            moved: What moved bodies add to both.
             rate_rad_per_s: How fast an error decays that has no other cause.
         """
-        repeats = 1 if self.is_tabulated else len(z)
-        m = LinearisedMechanism(*(np.repeat(part, repeats, axis=0) for part in self))
-        q = m.q + solve_nearest(m.jacobian, z - m.heights_m - moved[:, 0])
-        v = solve_nearest(m.jacobian, w - moved[:, 1])
-        bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
-        bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
+        m = self.about(z, w, moved)
         held = m._replace(
-            q=q,
-            v=v,
-            heights_m=m.heights_m + np.einsum("kij,kj->ki", m.jacobian, q - m.q),
-            rates_m_per_s=np.einsum("kij,kj->ki", m.jacobian, v),
-            bias=bias,
             bias_q=m.bias_q - rate_rad_per_s**2 * m.mass,
             bias_v=m.bias_v - 2.0 * rate_rad_per_s * m.mass,
         )
@@ -210,14 +221,9 @@ def _with_mockups(
             f"model {plant.spec.name}: an FMU in a strut of a bench whose bodies are moved is not "
             "supported in a diagnosis, expected a bench that is driven by forces"
         )
-    nodes = len(motion.t_s)
-    m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
     heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
-    q = m.q + solve_nearest(m.jacobian, heights_m - m.heights_m)
-    v = solve_nearest(m.jacobian, velocities)
-    bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
-    bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
-    bias_q, bias_v = m.bias_q, m.bias_v
+    m = mechanism.about(heights_m, velocities, np.zeros((len(heights_m), 2, heights_m.shape[1])))
+    bias, bias_q, bias_v = m.bias, m.bias_q, m.bias_v
     for strut, mockup in enumerate(plant.mockups):
         if mockup is not None:
             row = m.jacobian[:, strut]
@@ -227,8 +233,6 @@ def _with_mockups(
             bias_q = bias_q + square * by_height[:, np.newaxis, np.newaxis]
             bias_v = bias_v + square * by_velocity[:, np.newaxis, np.newaxis]
     linearised = m._replace(
-        q=q,
-        v=v,
         heights_m=heights_m,
         rates_m_per_s=velocities,
         bias=bias,

@@ -83,12 +83,13 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
     if pool.at_floor(pool.linear):
         return None
     first = _screen_single_laws(pool, progress)
-    best = _refined_level(pool, pool.linear_stage, pool.linear, [first.screenings]).probable[:1]
+    refined = _refined_level(pool, pool.linear_stage, pool.linear, [first.screenings])
+    best = refined.probable[:1]
     if not any(_gains(pool, pool.linear_stage, first.nothing, screening) for screening in best):
         pool.take_every_sample()
         first = _screen_single_laws(pool, progress)
+        refined = _refined_level(pool, pool.linear_stage, pool.linear, [first.screenings])
     stage, beam = pool.linear_stage, [first.nothing]
-    rounds: Sequence[Sequence[Screening]] = [first.screenings]
     levels: list[list[Screening]] = []
     for size in range(1, criteria.most_laws + 1):
         begin = _EXPLORED * (size - 1) / criteria.most_laws
@@ -96,7 +97,7 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         if levels:
             beam = _diverse(levels[-1], criteria.beam)
             rounds = _screen_rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
-        refined = _refined_level(pool, stage, pool.linear, rounds)
+            refined = _refined_level(pool, stage, pool.linear, rounds)
         level = refined.probable
         if not level or not _gains(
             pool, stage, min(beam, key=lambda screening: screening.validation_cost), level[0]

@@ -468,29 +468,12 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
     if not result.size and not pool.prefers(result, as_given := pool.validate(pool.given)):
         # Corrections that differ from zero and change nothing that can be measured.
         return _FewCorrections(as_given, chosen.fit, is_gain=False)
-    gain = _corrections_as_gain(problem, result.fit)
-    without_gain = _FewCorrections(result, chosen.fit, is_gain=False)
-    if gain is None:
-        return without_gain
-    linear, free = gain
-    if _contradicts_prior(problem, result.fit.parts.linear, linear, pool.criteria.significant):
-        return without_gain
-    # All forces were in the wrong proportion to the applied one: the laws', too.
-    laws = {
-        law: scale_law(law[1], values, 1.0 + float(linear[_gain_index(problem)]))
-        for law, values in law_values(problem, result.fit).items()
-    }
-    scaled = {law: values for law, values in laws.items() if values is not None}
-    if len(scaled) < len(laws):
-        return without_gain
-    bare = Candidate(chosen.fit.candidate.kept, ())
-    first = model_for(problem, result.fit.model, bare).with_linear(linear)
-    first = model_for(problem, first, chosen.fit.candidate, {**scaled})
-    refitted = fit(problem, first, free)
+    begun = _begin_with_gain(problem, result.fit, pool.criteria.significant)
+    refitted = None if begun is None else fit(problem, *begun)
     if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
         model = _with_significant_corrections(pool, lean)
         return _FewCorrections(model, chosen.fit, is_gain=True)
-    return without_gain
+    return _FewCorrections(result, chosen.fit, is_gain=False)
 
 
 def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
@@ -578,9 +561,27 @@ def _significant_parameters(result: Fit, significant: float) -> Flags:
     return needed
 
 
-def _gain_index(problem: Problem) -> int:
-    """Index of the gain of the applied force among the linear parameters."""
-    return next(i for i, p in enumerate(problem.linear) if p.kind == "gain")
+def _begin_with_gain(
+    problem: Problem, result: Fit, significant: float
+) -> tuple[CandidateModel, Flags] | None:
+    """Where a fit with a gain in place of other corrections begins, and what is free in it, (L,).
+
+    None where a gain saves none, or is farther from the model file's tolerances.
+    """
+    gain = _corrections_as_gain(problem, result)
+    if gain is None or _contradicts_prior(problem, result.parts.linear, gain[0], significant):
+        return None
+    linear, free = gain
+    (factor,) = (1.0 + linear[i] for i, p in enumerate(problem.linear) if p.kind == "gain")
+    # All forces were in the wrong proportion to the applied one: the laws', too.
+    laws: dict[int | StrutEffect, Array] = {}
+    for law, values in law_values(problem, result).items():
+        scaled = scale_law(law[1], values, float(factor))
+        if scaled is None:
+            return None
+        laws[law] = scaled
+    bare = model_for(problem, result.model, Candidate(result.candidate.kept, ()))
+    return model_for(problem, bare.with_linear(linear), result.candidate, laws), free
 
 
 def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] | None:

@@ -164,11 +164,9 @@ class Pool:
         """A fit with its cross-validation."""
         return ValidatedModel(result, validation_costs(self.problem, result))
 
-    def refit(
-        self, model: CandidateModel, most_level: float = np.inf, *, effort: Effort
-    ) -> Fit | None:
+    def refit(self, model: CandidateModel, effort: Effort) -> Fit | None:
         """Fit a model with all linear parameters that may be fitted together with its laws."""
-        return self._refit(self.problem, Begin(model, most_level), effort)
+        return self._refit(self.problem, Begin(model), effort)
 
     def _refit(self, problem: Problem, begin: Begin, effort: Effort) -> Fit | None:
         candidate, parts = begin.model
@@ -475,11 +473,8 @@ class Pool:
         Beside friction or hysteresis, which act there themselves, it corrects their formula.
         """
         few, many = Counter(smaller.families), Counter(larger.families)
-        if (
-            many - few != Counter(["friction"])
-            or few - many
-            or {"friction", "hysteresis"} & set(few)
-        ):
+        acts_there = not {"friction", "hysteresis"}.isdisjoint(few)
+        if many - few != Counter(["friction"]) or few - many or acts_there:
             return False
         (row,) = (row for row, name in new_laws(larger.fit) if effect(name).family == "friction")
         strut, force = forces_along(self.problem, larger.fit.model, self.along)[row]
