@@ -28,6 +28,10 @@ _STEP = 1e-8
 """Step of the central differences, in units of the state: so small that no observer comes near its
 limit."""
 
+POLE_ROUNDING = 1e-6
+"""Error of a pole by these differences: where friction remembers, poles are at exactly 1, and are
+found within a tenth of this."""
+
 _ACCELERATION_STEP_M_PER_S2 = 1e-2
 """Step of the residual force, over the effective mass."""
 
@@ -72,8 +76,10 @@ class LinearLoop(NamedTuple):
 
     def noise_covariance(self) -> Array:
         """Covariance of x by white noise of unit variance, (n, n); NaN if the loop is unstable."""
-        # Sum over all past samples: the discrete Lyapunov equation, by doubling.
-        power, covariance = self.a, np.outer(self.b[:, 0], self.b[:, 0])
+        # Sum over all past samples: the discrete Lyapunov equation, by doubling. What lies further
+        # back than rounding lets a pole at 1 remember does not count.
+        power = (1.0 - POLE_ROUNDING) * self.a
+        covariance = np.outer(self.b[:, 0], self.b[:, 0])
         for _ in range(60):
             with np.errstate(over="ignore", invalid="ignore"):
                 added = power @ covariance @ power.T

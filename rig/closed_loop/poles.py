@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.protocol import AnyPlant
-from rig.closed_loop.loop import Loop, SampleTiming
+from rig.closed_loop.loop import POLE_ROUNDING, Loop, SampleTiming
 from rig.observers.error_model import ErrorModel
 from rig.observers.protocol import AnyObserver
 
@@ -65,9 +65,13 @@ def least_damping(
 
 
 def least_damping_ratio(poles: Sequence[Pole]) -> float:
-    """Least damping ratio; an integrator that is switched off, a pole at 1, counts as 1."""
-    of_motion = [pole for pole in poles if abs(pole.magnitude - 1.0) > 1e-9]
-    return min((pole.damping_ratio for pole in of_motion), default=1.0)
+    """Least damping ratio; 1 without a pole."""
+    return min((pole.damping_ratio for pole in poles), default=1.0)
+
+
+def is_stable(poles: Sequence[Pole]) -> bool:
+    """Whether no error grows."""
+    return all(pole.magnitude <= 1.0 for pole in poles)
 
 
 def closed_loop_poles(
@@ -82,7 +86,11 @@ def closed_loop_poles(
 
 
 def poles_of(a: NDArray[np.float64], interval_s: float) -> list[Pole]:
-    """Poles of a discrete map of shape (n, n) over an interval, the slowest to decay first."""
+    """Poles of a discrete map of shape (n, n) over an interval, the slowest to decay first.
+
+    A pole at 1, by the memory of friction or an integrator that is switched off, harms nothing, and
+    is aperiodic.
+    """
     poles = [_pole(complex(value), interval_s) for value in np.linalg.eigvals(a)]
     return sorted((pole for pole in poles if pole.magnitude > 1e-6), reverse=True)
 
@@ -90,6 +98,8 @@ def poles_of(a: NDArray[np.float64], interval_s: float) -> list[Pole]:
 def _pole(z: complex, interval_s: float) -> Pole:
     if abs(z) < 1e-12:
         return Pole(0.0, 0.0, 1.0)
+    if abs(z - 1.0) < POLE_ROUNDING:
+        return Pole(1.0, 0.0, 1.0)
     s = cmath.log(z) / interval_s
     natural = abs(s)
-    return Pole(abs(z), natural / (2.0 * cmath.pi), -s.real / natural if natural > 0.0 else 1.0)
+    return Pole(abs(z), natural / (2.0 * cmath.pi), -s.real / natural)

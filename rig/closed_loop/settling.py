@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.protocol import AnyPlant
-from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
+from rig.closed_loop.loop import POLE_ROUNDING, LinearLoop, Loop, SampleTiming
 from rig.observers.protocol import AnyObserver
 
 Array = NDArray[np.float64]
@@ -20,9 +20,6 @@ Array = NDArray[np.float64]
 REMAINING_SHARE = 0.01
 """Share of a step of the residual force that a settled loop may still err by: that of the error
 with which the published gains follow the reference case."""
-
-_ROUNDING = 1e-6
-"""Error of a pole's magnitude by the differences that the loop is linearised with."""
 
 _BLOCK = 256
 """Intervals that are computed at once."""
@@ -55,12 +52,12 @@ def decay_time_ns(loop: LinearLoop) -> int | None:
     None if the loop is unstable, or takes longer than a minute.
     """
     slowest = max(np.abs(np.linalg.eigvals(loop.a)), default=0.0)
-    if slowest > 1.0 + _ROUNDING:
+    if slowest > 1.0 + POLE_ROUNDING:
         return None
     longest = round(_LONGEST_S / loop.interval_s)
     count = longest
     # An integrator that is switched off leaves a pole at exactly 1, which no error shows.
-    if slowest < 1.0 - _ROUNDING:
+    if slowest < 1.0 - POLE_ROUNDING:
         # Behind this the slowest pole has decayed to a thousandth of the share.
         count = min(count, int(np.log(1e-3 * REMAINING_SHARE) / np.log(max(slowest, 0.01))) + 1)
     last = -1

@@ -21,7 +21,13 @@ from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, find_corrected, linear_model, observability
-from rig.closed_loop.poles import OperatingPoint, Pole, closed_loop_poles, least_damping
+from rig.closed_loop.poles import (
+    OperatingPoint,
+    Pole,
+    closed_loop_poles,
+    is_stable,
+    least_damping,
+)
 from rig.closed_loop.strut_response import (
     FAST_SPEED_M_PER_S,
     find_driving_speeds_m_per_s,
@@ -578,7 +584,7 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     late = closed_loop_poles(plant, plan.observers, rest, timing._replace(delay=timing.delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
-    if worst < 1.0:
+    if is_stable(late):
         findings.append(Finding(Severity.OK, "poles, one cycle late", text))
         findings.append(_in_motion(plan, plant, rest, timing))
     elif findings[0].severity is not Severity.ERROR:
@@ -703,8 +709,7 @@ def _worst(poles: list[Pole]) -> Finding:
         f"largest |z| {slowest.magnitude:.5f}; least damped at {ringing.frequency_hz:.1f} Hz "
         f"with damping ratio {ringing.damping_ratio:.3f}"
     )
-    # An integrator that is switched off leaves a pole at exactly 1, which harms nothing.
-    if ringing.damping_ratio < 0.0 or slowest.magnitude > 1.0 + 1e-6:
+    if not is_stable(poles):
         text += ": unstable, lower the gains or raise the rate"
         return Finding(Severity.ERROR, "poles", text)
     if ringing.damping_ratio < LITTLE_DAMPING:

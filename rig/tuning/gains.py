@@ -19,6 +19,7 @@ from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
 from rig.closed_loop.poles import (
     OperatingPoint,
     Pole,
+    is_stable,
     least_damping,
     least_damping_ratio,
     poles_of,
@@ -180,7 +181,7 @@ def expect_error(problem: TuningProblem, observer: AnyObserver) -> ExpectedError
     """Expected error of an observer of a strut; infinite where its loop is unstable."""
     linear = problem.linear(observer)
     poles = poles_of(linear.a, linear.interval_s)
-    if not _is_stable(poles):
+    if not is_stable(poles):
         return ExpectedError(math.inf, math.inf, poles, math.inf)
     noise_n = linear.noise_gain_n_per_m() * problem.expectation.noise_std_m
     share = linear.lag_gain(problem.expectation.frequency_hz)
@@ -267,15 +268,10 @@ def sweep_bandwidth(
     ]
 
 
-def _is_stable(poles: Sequence[Pole]) -> bool:
-    # An integrator that is switched off leaves a pole at exactly 1, which harms nothing.
-    return max((pole.magnitude for pole in poles), default=0.0) < 1.0 + 1e-9
-
-
 def _is_stable_at(problem: TuningProblem, observer: AnyObserver, factor: float) -> bool:
     """Whether the loop is stable where the model responds more strongly by a factor."""
     linear = problem.linear(observer, factor)
-    return _is_stable(poles_of(linear.a, linear.interval_s))
+    return is_stable(poles_of(linear.a, linear.interval_s))
 
 
 def _has_margin(problem: TuningProblem, observer: AnyObserver, factor: float) -> bool:

@@ -10,7 +10,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, dump_model, load_model, parse_model
 from rig.bridge.mode_supervisor import Supervision
 from rig.closed_loop.loop import SampleTiming
-from rig.closed_loop.poles import Pole, closed_loop_poles
+from rig.closed_loop.poles import Pole, closed_loop_poles, is_stable
 from rig.observers.pi import PiObserver
 from tests.bridge.cores import (
     FIRST,
@@ -145,6 +145,19 @@ ROOT = {
     "name": "power_damping",
     "parameters": {"force_at_1_m_per_s_n": 100.0, "exponent": 0.5},
 }
+
+
+@pytest.mark.parametrize("proportional", [1e4, 2e4, 3e4, 5e4])
+def test_elements_that_stick_keep_what_they_remember(proportional):
+    """Where the motion is slow, Iwan's elements neither grow nor forget: their poles are at 1."""
+    law = {
+        "name": "iwan",
+        "parameters": {"yield_force_n": 30.0, "yield_displacement_m": 0.004},
+    }
+    observer = (gains(proportional, 1e4, 5000.0),)
+    found = closed_loop_poles(with_effects(law), observer, (REST_M,), SampleTiming(MS))
+    assert sum(pole.magnitude == 1.0 for pole in found) >= 6
+    assert is_stable(found)
 
 
 @pytest.mark.parametrize(("every", "delay"), [(1, 0), (2, 0), (1, 3)])

@@ -54,7 +54,14 @@ def _follow(
         read_recording(folder / "test.csv"),
         case.sensors.height_noise_m,
         diagnosis["held_out"]["residual_force_rmse_n"]["after"],
+        _late_s(diagnosis),
     )
+
+
+def _late_s(diagnosis: dict) -> float:
+    """By how much later than the applied force the height shows what is true, as found."""
+    found = (it["total"] for it in diagnosis["channels"] if it["parameter"] == "delay_s")
+    return max([0.0, *(total["value"] for total in found if total["low"] is not None)])
 
 
 def failed(message: str) -> dict:

@@ -20,7 +20,7 @@ from tests.truth.simulation import height_floor_m
 NAMES_A_CAUSE = frozenset({"explained", "partly_explained", "ambiguous"})
 NO_CAUSE = "restoring_surface"
 LIVE_MULTIPLE = 3.0
-"""Times the noise that a right model's innovation may be: a force that is held for a tick adds to
+"""Times the noise that a right model's innovation may be: that a force is held for a tick adds to
 it where the noise is small."""
 SIDE_EFFECTS = {"stiffness": frozenset({"preload"})}
 """Linear family -> what a correction of it brings along: stiffness is about the free length in the

@@ -27,7 +27,7 @@ SETTLED = 0.5
 
 
 def live_innovation(
-    spec: ModelSpec, recording: Recording, noise_m: float, residual_n: float
+    spec: ModelSpec, recording: Recording, noise_m: float, residual_n: float, late_s: float = 0.0
 ) -> float:
     """RMS innovation over the noise of the height, of a model of one strut with tuned gains.
 
@@ -37,9 +37,12 @@ def live_innovation(
     Args:
         noise_m: Standard deviation of the height's noise.
         residual_n: RMS of the force that the model leaves.
+        late_s: By how much later than the applied force the height shows what is true.
     """
     plant = DartPlant(spec)
     period_ns = round(1e9 * float(np.median(np.diff(recording.t_s))))
+    late_ns = round(1e9 * late_s)
+    expected_n = math.hypot(residual_n, _lost_by_holding_n(recording))
     rest_m = [float(np.nanmean(recording.heights_m[:, 0]))]
     problem = TuningProblem(
         plant,
@@ -47,8 +50,8 @@ def live_innovation(
         0,
         linearise_at(plant, rest_m),
         rest_m,
-        SampleTiming(period_ns),
-        expectation_from_noise(noise_m, residual_n, UP_TO_HZ),
+        SampleTiming.of(period_ns, period_ns, late_ns),
+        expectation_from_noise(noise_m, expected_n, UP_TO_HZ),
         LIMIT_N,
         [OperatingPoint(rest_m, FAST_SPEED_M_PER_S)],
     )
@@ -58,9 +61,10 @@ def live_innovation(
         return math.inf
     if tuned.gain_margin <= 1.0 or tuned.in_motion <= 0.0:
         return math.inf
-    rig = supervised(plant, (tuned.observer,), bench=channels(1, interval_ns=period_ns))
+    bench = channels(1, interval_ns=period_ns, delay_ns=late_ns)
+    rig = supervised(plant, (tuned.observer,), bench=bench)
     state, innovations_m, forces_n = rig.init(0), list[float](), list[float]()
-    for step_input in _inputs(recording, period_ns):
+    for step_input in _inputs(recording, period_ns, late_ns):
         state, output, _ = rig.step(state, step_input)
         innovations_m += [strut.innovation_m for strut in output.struts]
         forces_n += [strut.force_n for strut in output.struts]
@@ -70,11 +74,20 @@ def live_innovation(
     return float(np.sqrt(np.nanmean(late**2))) / noise_m
 
 
-def _inputs(recording: Recording, period_ns: int) -> Iterator[StepInput]:
+def _lost_by_holding_n(recording: Recording) -> float:
+    """RMS of what a force that is held from tick to tick differs by from that of the bench.
+
+    It acts half a tick late.
+    """
+    force_n = recording.applied_force_n
+    return 0.0 if force_n is None else float(np.sqrt(np.nanmean((0.5 * np.diff(force_n)) ** 2)))
+
+
+def _inputs(recording: Recording, period_ns: int, late_ns: int) -> Iterator[StepInput]:
     further = ((APPLIED_FORCE, recording.applied_force_n), (TEMPERATURE, recording.temperature_c))
     for tick, height_m in enumerate(recording.heights_m[:, 0].tolist()):
         t_ns = tick * period_ns
-        samples = [] if math.isnan(height_m) else [Sample(0, height_m, t_ns)]
+        samples = [] if math.isnan(height_m) else [Sample(0, height_m, t_ns - late_ns)]
         samples += [
             bench_sample(1, quantity, float(values[tick]), t_ns)
             for quantity, values in further
