@@ -117,7 +117,9 @@ def find_changes(
         tested = [
             *chain.from_iterable(pool.map(lambda jobs: _test_sized(base, jobs), batches)),
             *pool.map(lambda job: _test_addition(base, *job), whole),
-            *pool.map(lambda job: _test_exchange(base, job[0], replaced[job[1]]), exchanges),
+            *chain.from_iterable(
+                pool.map(lambda job: _test_exchange(base, job[0], replaced[job[1]]), exchanges)
+            ),
         ]
     best: dict[Candidate, ModelChange] = {}
     for change in sorted((c for c in tested if c is not None), key=lambda change: change.cost):
@@ -191,24 +193,31 @@ def _remove_law_force(base: _Base, at: StrutEffect) -> _ReplacedLaw:
     return _ReplacedLaw(at, values, linear, force_n - linear @ (linear.T @ force_n))
 
 
-def _test_exchange(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> ModelChange | None:
-    values = _match_force(base, at, old)
-    if values is None:
-        return None
+def _test_exchange(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> list[ModelChange]:
+    """Exchanges of a law for another, from each of its starts and from where it is most alike.
+
+    A law that is more general than the replaced one is that one where it is most alike, and shows
+    nothing of what it may gain.
+    """
     candidate = base.fit.candidate.without(old.law).with_effects(at)
-    column = _response(base, candidate, at, values)
-    if column is None:
-        return None
-    # A share of the way from the old law to this one.
-    size = float(np.clip(_best_size(base, column), 0.0, 1.0))
-    return _change(base, candidate, at, values, size * column)
+    tested: list[ModelChange] = []
+    for values in _match_force(base, at, old):
+        column = _response(base, candidate, at, values)
+        if column is not None:
+            # A share of the way from the old law to this one.
+            size = float(np.clip(_best_size(base, column), 0.0, 1.0))
+            tested.append(_change(base, candidate, at, values, size * column))
+    return tested
 
 
-def _match_force(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> Array | None:
-    """Parameters with which a law's force is nearest to another's, up to a linear force."""
+def _match_force(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> list[Array]:
+    """Parameters with which a law's force is near another's, up to a linear force.
+
+    Those where it is nearest, and its starts with the nearest size; none where there is no force.
+    """
     scaled, unit = list(effect(at[1]).scaled), float(np.linalg.norm(old.force_n))
     if unit <= 0.0:
-        return None
+        return []
 
     def shape(values: Array) -> Array:
         force_n = _forces(base, at, values)
@@ -225,11 +234,12 @@ def _match_force(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> Array | Non
         residual = mismatch(values)
         begins.append((float(residual @ residual), values))
     if not begins:
-        return None
+        return []
     first = min(begins, key=lambda begin: begin[0])[1]
     space = law_space(at[1], base.problem.motions[at[0]], first)
     solution = solve(Differences(mismatch), first, space, _MATCHING)
-    return None if solution is None else solution.values
+    nearest = [] if solution is None else [solution.values]
+    return [*nearest, *(np.clip(values, space.low, space.high) for _, values in begins)]
 
 
 def _response(base: _Base, candidate: Candidate, at: StrutEffect, values: Array) -> Array | None:
