@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.diagnose import diagnose, first_fits
+from rig.diagnosis.problem.build import build_problems
+from rig.diagnosis.problem.problem import rms, rms_about_mean
+from rig.diagnosis.search.criteria import CRITERIA
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import is_at_the_floor, missing
@@ -44,6 +47,19 @@ def test_noise_of_the_recorded_force_is_no_effect():
     found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
     assert found.verdict == "nothing_missing"
     assert found.effects == ()
+
+
+@pytest.mark.parametrize(("noise_n", "is_predictable"), [(1.0, True), (300.0, False)])
+def test_noise_of_the_force_excuses_no_more_than_a_tenth_of_the_motion(noise_n, is_predictable):
+    run = with_force_noise(bench.run(bench.Nothing()), 51, noise_n)
+    problem = build_problems(bench.model(), [run], [], CRITERIA.blocks, 5).learnt
+    disturbances_m = problem.disturbances_m(0, first_fits(problem)[0].model, 4)
+    sizes_m, motion_m = (
+        [rms(it) for it in disturbances_m],
+        rms_about_mean(problem.grids[0].heights_m),
+    )
+    assert max(sizes_m) <= (1.0 + 1e-9) * 0.1 * motion_m
+    assert (max(sizes_m) < 0.099 * motion_m) is is_predictable
 
 
 @pytest.mark.long

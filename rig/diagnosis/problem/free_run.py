@@ -95,6 +95,9 @@ _LEVEL_DRAWS, _FLOOR_DRAWS = 3, 8
 """Draws of the applied force's noise. Their mean square is known to a third with three; of a floor
 the largest counts, since a lightly damped motion answers to it in so few independent swings that
 their RMS scatters by a third."""
+_PREDICTABLE = 0.1
+"""Share of the motion's RMS that the inputs' noise may account for. Where impacts amplify it, two
+runs of one model differ by the motion itself, and a wrong model's would excuse any error."""
 _LONGER_ANGLE, _LONGER_ERROR = 0.08, 0.02
 """Longest steps of fits that search: angle of the fastest motion within one (with twice as much a
 stop errs by a quarter of usual noise), and RMS of what they change of the best linear model, as a
@@ -518,7 +521,8 @@ class FreeRunProblem(Problem):
     def disturbances_m(self, k: int, model: CandidateModel, draws: int) -> list[Array]:
         """Heights that draws of the inputs' noise cause, drift of springless axes included.
 
-        Each of shape (N, struts); an empty list where there is no noise, or the model runs away.
+        Each of shape (N, struts), no more than is predictable; an empty list where there is no
+        noise, or the model runs away.
         """
         run, start = self._before_delays(k, model), model.parts.starts[k]
         stds = self._input_noise[k]
@@ -533,8 +537,9 @@ class FreeRunProblem(Problem):
             if disturbed is not None:
                 disturbances.append(disturbed.heights_m - motion.heights_m)
         if run.drive.moved and disturbances:
-            return _without(self._free_motions(run, model, start, motion), disturbances)
-        return disturbances
+            disturbances = _without(self._free_motions(run, model, start, motion), disturbances)
+        most_m = _PREDICTABLE * rms_about_mean(self.grids[k].heights_m)
+        return [it * min(1.0, most_m / max(rms(it), 1e-300)) for it in disturbances]
 
     def _free_motions(
         self, run: DrivenRun, model: CandidateModel, start: Array, motion: Trajectory
