@@ -6,6 +6,7 @@ References:
     Letters 15 (1994): the search continues at once from what lowers the residual most.
 """
 
+import sys
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
@@ -227,8 +228,23 @@ def _expand_in_simulation(
         for change in pool.changes(model)
         if change.cost < min(least, known.get(change.model.candidate, least))
     ]
+    changes = _plainest_first(changes, pool.highest_at_floor(model))
     chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size)
     pool.attempt_changes(chosen, within(progress, 0.5, 1.0))
+
+
+def _plainest_first(changes: Sequence[ModelChange], at_floor: float) -> list[ModelChange]:
+    """Changes that promise the noise floor, with the fewest parameters first; then the others.
+
+    A linearisation does not tell formulas apart that are all as good as the noise lets them be.
+    """
+
+    def order(change: ModelChange) -> tuple[int, float]:
+        if change.cost < at_floor:
+            return len(change.model.parts.effects), change.cost
+        return sys.maxsize, change.cost
+
+    return sorted(changes, key=order)
 
 
 def _promising(

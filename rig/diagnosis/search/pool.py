@@ -446,8 +446,15 @@ class Pool:
         """Whether a model is at the noise floor, so that a law could explain nothing more."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
         share = later if model.size else first
+        return model.cost < self._highest_at_floor(model, share)
+
+    def highest_at_floor(self, model: ValidatedModel) -> float:
+        """Sum of squares below which a model with laws is at the floor, by that of a near one."""
+        return self._highest_at_floor(model, self.criteria.least_above_noise_later)
+
+    def _highest_at_floor(self, model: ValidatedModel, share: float) -> float:
         share += self.criteria.scatter * math.sqrt(2.0 / model.fit.rows)
-        return model.cost < (1.0 + share) * self.floor(model)
+        return (1.0 + share) * self.floor(model)
 
     def floor(self, model: ValidatedModel) -> float:
         """Sum of squares of a right model: noise of the sensors, and of the applied force."""
