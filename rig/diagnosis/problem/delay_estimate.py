@@ -22,9 +22,9 @@ _ITERATIONS = 6
 """Most steps; the fit that follows searches about what they reach."""
 _WIDTH = 5.0
 """Standard deviations about an estimate within which a delay is searched for."""
-_LEAST_WIDTH_S, _LEAST_OF_SEVERAL_S = 0.5e-3, 1e-3
+_LEAST_WIDTH_S = 1e-3
 """Least time for which that is: the functions of the estimate bend less than a stop, whose contact
-they take for 0.1 ms. And that of several struts: on a car's posts a delay that all channels of one
+they take for 0.1 ms; a tone was taken for 0.8 ms; on a car's posts a delay that all channels of one
 corner have in common was estimated with errors of 0.6 ms."""
 _VAGUE_S = 0.2e-3
 """Standard deviation from which on an estimate is vague: friction that weakens with speed was taken
@@ -38,9 +38,8 @@ _MOST_SAMPLES = 40_000
 def with_estimated_delays(problem: Problem) -> Problem:
     """The problem whose delays are searched about first estimates of them."""
     found = estimate_delays(problem)
-    least_s = _LEAST_WIDTH_S if len(problem.motions) == 1 else _LEAST_OF_SEVERAL_S
     linear = tuple(
-        _about(p, *found[p.channel], least_s) if p.channel in found else p for p in problem.linear
+        _about(p, *found[p.channel]) if p.channel in found else p for p in problem.linear
     )
     return replace(problem, linear=linear)
 
@@ -64,18 +63,16 @@ def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
     return {problem.linear[i].channel: (d, std) for i, d, std in estimates if np.isfinite(std)}
 
 
-def _about(
-    parameter: LinearParameter, delay_s: float, std_s: float, least_s: float
-) -> LinearParameter:
+def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
     """A delay that is searched for from an estimate on, of which the recordings know the error.
 
-    `least_s` is the least time about it. Of a vague estimate, none at all remains possible.
+    Of a vague estimate, none at all remains possible.
     """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
-    width_s = max(_WIDTH * std_s, least_s)
+    width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
     least, most = expected_s - width_s, expected_s + width_s
     if std_s > _VAGUE_S:
-        least, most = min(least, -least_s), max(most, least_s)
+        least, most = min(least, -_LEAST_WIDTH_S), max(most, _LEAST_WIDTH_S)
     return parameter._replace(expected=expected_s, least=least, most=most)
 
 
