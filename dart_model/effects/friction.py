@@ -94,9 +94,8 @@ def _elastoplastic_rate(velocity_m_per_s: float, deflection: float, presliding_m
     # Elastic up to the limit, then sliding. The deflection approaches the limit gradually: if it
     # stopped there within a step, the force would have no derivative by the parameters.
     speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
-    if velocity_m_per_s * deflection > 0.0:
-        speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(deflection)), 0.0))
-    return math.copysign(speed, velocity_m_per_s)
+    ahead = 1.0 - math.copysign(deflection, velocity_m_per_s * deflection)
+    return math.copysign(min(speed, max(_FASTEST_SETTLING_PER_S * ahead, 0.0)), velocity_m_per_s)
 
 
 def _lugre(

@@ -66,10 +66,8 @@ def _iwan_rate(
     speed = velocity_m_per_s / (yield_displacement_m * ELEMENTS)
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
-        room = math.inf
-        if velocity_m_per_s * elements[i] > 0.0:
-            room = max(_FASTEST_SETTLING_PER_S * (limit - abs(elements[i])), 0.0)
-        rates[i] = math.copysign(min(abs(speed), room), speed)
+        ahead = limit - math.copysign(elements[i], speed * elements[i])
+        rates[i] = math.copysign(min(abs(speed), max(_FASTEST_SETTLING_PER_S * ahead, 0.0)), speed)
 
 
 def _spring(spring_deflection_m: float, stiffness_n_per_m: float) -> float:

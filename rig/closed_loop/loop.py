@@ -24,7 +24,7 @@ from rig.observers.strut_observers import ObserversState, StrutObservers
 
 Array = NDArray[np.float64]
 
-_STEP = 1e-8
+_STEP = 1e-7
 """Step of the central differences, in units of the state: so small that no observer comes near its
 limit."""
 

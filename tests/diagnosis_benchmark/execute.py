@@ -17,7 +17,7 @@ from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
-from tests.diagnosis_benchmark.live import live_innovation
+from tests.diagnosis_benchmark.live import live_force
 from tests.diagnosis_benchmark.moving import MovingCase, write_moving
 from tests.diagnosis_benchmark.plan import Slot, fill, ratios_of
 from tests.truth.files import write_case
@@ -46,10 +46,10 @@ def diagnose(folder: Path) -> tuple[dict, ModelSpec | None]:
 def _follow(
     case: Case | MovingCase, corrected: ModelSpec | None, diagnosis: dict, folder: Path
 ) -> float | None:
-    """How a corrected model follows the held-out run, as `Result.live_innovation`."""
+    """How a corrected model follows the held-out run, as `Result.live_force_ratio`."""
     if corrected is None or isinstance(case, MovingCase) or case.is_dyno:
         return None
-    return live_innovation(
+    return live_force(
         corrected,
         read_recording(folder / "test.csv"),
         case.sensors.height_noise_m,
@@ -86,7 +86,7 @@ def crashed(slot: Slot, error: BaseException) -> Result:
     """The result of a slot whose diagnosis broke off."""
     case = fill(slot)
     judged = judge(case, (), failed(repr(error)), slot.name, slot.group)
-    return Result(**judged, duration_s=math.nan, live_innovation=None)
+    return Result(**judged, duration_s=math.nan, live_force_ratio=None)
 
 
 @contextmanager
@@ -125,7 +125,7 @@ def execute(slot: Slot, out: Path, limit_s: float) -> Result:
     duration_s = time.perf_counter() - started
     live = _follow(case, corrected, diagnosis, folder)
     judged = judge(case, ratios, diagnosis, slot.name, slot.group)
-    result = Result(**judged, duration_s=duration_s, live_innovation=live)
+    result = Result(**judged, duration_s=duration_s, live_force_ratio=live)
     if result.verdict == "failed":
         return result
     kept.parent.mkdir(parents=True, exist_ok=True)

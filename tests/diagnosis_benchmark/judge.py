@@ -19,9 +19,8 @@ from tests.truth.simulation import height_floor_m
 
 NAMES_A_CAUSE = frozenset({"explained", "partly_explained", "ambiguous"})
 NO_CAUSE = "restoring_surface"
-LIVE_MULTIPLE = 3.0
-"""Times the noise that a right model's innovation may be: that a force is held for a tick adds to
-it where the noise is small."""
+LIVE_MULTIPLE = 2.0
+"""Times its floor that the residual force of a right model may be, as an observer finds it."""
 SIDE_EFFECTS = {"stiffness": frozenset({"preload"})}
 """Linear family -> what a correction of it brings along: stiffness is about the free length in the
 file, and about mid-stroke in a diagnosis, where its change is a preload as well."""
@@ -57,9 +56,10 @@ class Result:
         intervals: Parameters that the truth can be held against.
         overlaps: Of where stops and knees show with where they were planted (F1).
         duration_s: Wall time of the diagnosis.
-        live_innovation: RMS innovation of the corrected model over the noise of the height, while
-            it follows the held-out run with tuned gains; infinite where the loop is unstable or a
-            force is not finite; None on a dyno and with a base that is moved.
+        live_force_ratio: RMS residual force that an observer finds of the corrected model over its
+            floor (see `live_force`), while it follows the held-out run with tuned gains; infinite
+            where the loop is unstable or a force is not finite; None on a dyno and with a base that
+            is moved.
         message: What went wrong, if it failed.
     """
 
@@ -87,7 +87,7 @@ class Result:
     intervals: tuple[Interval, ...]
     overlaps: tuple[float, ...]
     duration_s: float
-    live_innovation: float | None
+    live_force_ratio: float | None
     message: str
 
     @property
@@ -95,7 +95,7 @@ class Result:
         """Whether the corrected model runs, and leaves noise alone where all is explained."""
         is_complete = self.verdict in {"explained", "ambiguous", "nothing_missing"}
         most = LIVE_MULTIPLE if is_complete else math.inf
-        return self.live_innovation is not None and self.live_innovation < most
+        return self.live_force_ratio is not None and self.live_force_ratio < most
 
     @property
     def floor_multiple(self) -> float:

@@ -17,22 +17,23 @@ from rig.closed_loop.strut_response import FAST_SPEED_M_PER_S, linearise_at
 from rig.recordings.recording import Recording
 from rig.tuning.expectation import expectation_from_noise
 from rig.tuning.gains import Aim, TuningProblem, tune_observer
-from tests.bridge.cores import GAINS, bench_sample, channels, supervised
+from tests.bridge.cores import GAINS, SUPERVISION, bench_sample, channels, supervised
 
 LIMIT_N = 5000.0
 UP_TO_HZ = 20.0
 """Frequency up to which a model's remaining force is expected."""
 SETTLED = 0.5
-"""Share of the recording from which on the innovation counts."""
+"""Share of the recording from which on the force counts."""
 
 
-def live_innovation(
+def live_force(
     spec: ModelSpec, recording: Recording, noise_m: float, residual_n: float, late_s: float = 0.0
 ) -> float:
-    """RMS innovation over the noise of the height, of a model of one strut with tuned gains.
+    """RMS residual force that an observer finds of a right model of one strut, over its floor.
 
-    The model follows the recording tick by tick. Infinite where no gains make the loop stable, or a
-    force is not finite.
+    The model follows the recording tick by tick, with tuned gains. The floor is what the model
+    leaves, what is lost by holding the applied force, and what the noise of the height makes of
+    the gains. Infinite where no gains make the loop stable, or a force is not finite.
 
     Args:
         noise_m: Standard deviation of the height's noise.
@@ -62,16 +63,17 @@ def live_innovation(
     if tuned.gain_margin <= 1.0 or tuned.in_motion <= 0.0:
         return math.inf
     bench = channels(1, interval_ns=period_ns, delay_ns=late_ns)
-    rig = supervised(plant, (tuned.observer,), bench=bench)
-    state, innovations_m, forces_n = rig.init(0), list[float](), list[float]()
+    stale_after_s = SUPERVISION.stale_after_s + late_s
+    supervision = SUPERVISION.model_copy(update={"stale_after_s": stale_after_s})
+    rig = supervised(plant, (tuned.observer,), supervision, bench=bench)
+    state, found_n = rig.init(0), list[float]()
     for step_input in _inputs(recording, period_ns, late_ns):
         state, output, _ = rig.step(state, step_input)
-        innovations_m += [strut.innovation_m for strut in output.struts]
-        forces_n += [strut.force_n for strut in output.struts]
-    if not forces_n or not np.all(np.isfinite(forces_n)):
+        found_n += [strut.force_n - strut.law_force_n for strut in output.struts]
+    if not found_n or not np.all(np.isfinite(found_n)):
         return math.inf
-    late = np.array(innovations_m)[round(SETTLED * len(innovations_m)) :]
-    return float(np.sqrt(np.nanmean(late**2))) / noise_m
+    late_n = np.array(found_n)[round(SETTLED * len(found_n)) :]
+    return float(np.sqrt(np.mean(late_n**2))) / math.hypot(expected_n, tuned.expected.noise_n)
 
 
 def _lost_by_holding_n(recording: Recording) -> float:

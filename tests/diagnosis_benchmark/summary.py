@@ -84,9 +84,9 @@ that they are independent, and may be too narrow. *F1 of the range in which it a
 of the stroke in which a stop shows, and of the speeds at which a knee does, with those at which
 they were planted (twice what is common over the sum of both). *Runs live* is the share of corrected
 models that follow the held-out run tick by tick at its rate, with the gains that `rig tune` finds
-for them: the loop is stable, no force is infinite, and where all is explained the RMS innovation is
-at most {LIVE_MULTIPLE:g} times the noise. The durations depend on the load of
-the machine, which is stated at the end of the page.
+for them: the loop is stable, no force is infinite, and where all is explained the residual force
+that the observer finds is at most {LIVE_MULTIPLE:g} times its floor. The durations depend on the
+load of the machine, which is stated at the end of the page.
 """
 
 
@@ -160,7 +160,7 @@ def figures(results: list[Result]) -> dict[str, object]:
         "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
         "explained_worst": _percentile(explained, 100),
         "coverage": rate(interval.holds for interval in held),
-        "runs_live": rate(r.runs_live for r in results if r.live_innovation is not None),
+        "runs_live": rate(r.runs_live for r in results if r.live_force_ratio is not None),
         "overlaps": len(overlaps),
         "overlap_mean": float(np.mean(overlaps)) if overlaps else None,
         "verdicts": dict(Counter(result.verdict for result in results)),

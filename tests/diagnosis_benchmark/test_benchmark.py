@@ -22,7 +22,7 @@ from tests.diagnosis_benchmark.execute import (
     within,
 )
 from tests.diagnosis_benchmark.judge import Result, false_names, is_right, is_unbound, judge
-from tests.diagnosis_benchmark.live import live_innovation
+from tests.diagnosis_benchmark.live import live_force
 from tests.diagnosis_benchmark.plan import GROUPS, Slot, fill, part_of, slots
 from tests.diagnosis_benchmark.summary import (
     COLUMNS,
@@ -41,7 +41,7 @@ from tests.truth.plant import Bench, Case, Excitation, Planted, Roughness, RunPl
 BENCH = Bench(10.0, 1000.0, 20.0, 0.5)
 LOAD = RunPlan(Excitation("multisine", 1.0, 0.0, 1.0, 4.0, 0.5, 1.0, 0), 0.0, 20.0, 0)
 STROKE = RunPlan(Stroke(0.05, 0.5, 0.5, 4.0, 1.0, 1.0, 0), 0.0, 20.0, 0)
-TIMES = {"duration_s": 1.0, "live_innovation": 1.0}
+TIMES = {"duration_s": 1.0, "live_force_ratio": 1.0}
 BOUNDED = {"value": 1.0, "low": 0.9, "high": 1.1}
 OPEN = {"value": 1.0, "low": None, "high": 1.1}
 NOTHING = {"value": 0.1, "low": -0.1, "high": 0.3}
@@ -434,8 +434,8 @@ def test_a_stop_and_a_knee_are_held_against_where_they_were_planted():
 def test_a_corrected_model_that_explains_all_leaves_noise_alone_live():
     results = [
         Result(**judge(case_of(), (), diagnosis(verdict), "slot", "complete"), duration_s=1.0,
-               live_innovation=innovation)
-        for verdict, innovation in (
+               live_force_ratio=ratio)
+        for verdict, ratio in (
             ("nothing_missing", 1.0), ("nothing_missing", 9.0), ("partly_explained", 9.0),
             ("partly_explained", math.inf), ("partly_explained", None),
         )
@@ -450,7 +450,7 @@ def test_a_model_follows_its_bench_and_another_does_not():
     noise_m = 1e-5
     recording = little_bench.run(little_bench.Nothing(), noise_m=noise_m)
     right, wrong = (
-        live_innovation(
+        live_force(
             little_bench.model(stiffness=share * little_bench.STIFFNESS),
             recording,
             noise_m,
