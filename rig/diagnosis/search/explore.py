@@ -170,13 +170,19 @@ def _gains(pool: Pool, stage: Stage, before: Screening, after: Screening) -> boo
 
 
 def _expand_best(pool: Pool, progress: Progress) -> None:
-    """Add laws to the best model and exchange its laws; repeat with the new best one."""
-    expanded: set[Candidate] = set()
+    """Add laws to the best model and exchange its laws; repeat with the new best one.
+
+    A best one that is better by less than a law has to gain is not a step towards another model.
+    """
+    expanded: dict[Candidate, ValidatedModel] = {}
     for turn in range(2 * pool.criteria.most_laws):
         reference = pool.next_to_expand()
         if pool.at_floor(pool.converge_least()) or reference.fit.candidate in expanded:
             return
-        expanded.add(reference.fit.candidate)
+        before = [it for known, it in expanded.items() if known not in pool.invalid]
+        if before and not pool.gains_share(reference, min(before, key=lambda it: it.cost)):
+            return
+        expanded[reference.fit.candidate] = reference
         begin, end = 1.0 - _REST_AFTER_TURN**turn, 1.0 - _REST_AFTER_TURN ** (turn + 1)
         _expand(pool, reference, within(progress, begin, end))
 

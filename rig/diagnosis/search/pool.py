@@ -442,6 +442,10 @@ class Pool:
             and gain > share * smaller.excess
         )
 
+    def gains_share(self, model: ValidatedModel, before: ValidatedModel) -> bool:
+        """Whether a model is better than another by the least share that a law has to gain."""
+        return before.cost - model.cost > self.criteria.least_share * before.excess
+
     def at_floor(self, model: ValidatedModel) -> bool:
         """Whether a model is at the noise floor, so that a law could explain nothing more."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
