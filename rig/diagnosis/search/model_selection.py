@@ -125,7 +125,8 @@ def select_model(
             most_laws = chosen.size - 1
             continue
         # A rival that was fitted until converged may be the better model.
-        if is_repeated or pool.chosen(most_laws).fit.candidate == best.fit.candidate:
+        known = best.fit.candidate, chosen.fit.candidate
+        if is_repeated or pool.chosen(most_laws).fit.candidate in known:
             break
         is_repeated = True
     progress("comparing rivals", 0.9)
