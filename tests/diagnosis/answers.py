@@ -55,11 +55,16 @@ def same_answer(one, other, rel=0.01):
 
     Linear corrections within the accuracy are no difference.
     """
-    assert other.verdict == one.verdict
-    assert [e.name for e in other.effects] == [e.name for e in one.effects]
+    same_names(one, other)
     for before, after in zip(one.effects, other.effects, strict=True):
         for name, estimate in before.parameters.items():
             assert after.parameters[name].value == pytest.approx(estimate.value, rel=rel), name
+
+
+def same_names(one, other):
+    """Assert that two diagnoses name the same, with the same verdict and the same rivals."""
+    assert other.verdict == one.verdict
+    assert [e.name for e in other.effects] == [e.name for e in one.effects]
     assert other.ambiguous_with == one.ambiguous_with
 
 

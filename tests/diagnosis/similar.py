@@ -88,17 +88,24 @@ def mirrored(record, about_m):
 def cut(record):
     """A recording's two halves."""
     half = len(record.t_s) // 2
+    return (
+        replace(_rows(record, slice(0, half)), name=f"{record.name}a"),
+        replace(_rows(record, slice(half, None)), name=f"{record.name}b"),
+    )
 
-    def part(name, rows):
-        arrays = {
-            key: None if getattr(record, key) is None else getattr(record, key)[rows]
-            for key in ("t_s", "heights_m", "strut_forces_n", "temperature_c")
-        }
-        applied = record.applied_force_n
-        inputs = {} if applied is None else driven_by(applied[rows])
-        return replace(record, name=name, inputs=inputs, **arrays)
 
-    return part(f"{record.name}a", slice(0, half)), part(f"{record.name}b", slice(half, None))
+def thinned(record, every):
+    """Each n-th sample of a recording."""
+    return _rows(record, slice(None, None, every))
+
+
+def _rows(record, rows):
+    arrays = {
+        key: None if getattr(record, key) is None else getattr(record, key)[rows]
+        for key in ("t_s", "heights_m", "strut_forces_n", "temperature_c")
+    }
+    applied = record.applied_force_n
+    return replace(record, inputs={} if applied is None else driven_by(applied[rows]), **arrays)
 
 
 def shifted(record, by_s):

@@ -19,8 +19,9 @@ from tests.diagnosis.answers import (
     missing,
     overlap,
     same_answer,
+    same_names,
 )
-from tests.diagnosis.similar import Scale, cut, mirrored, shifted
+from tests.diagnosis.similar import Scale, cut, mirrored, shifted, thinned
 
 
 class Friction(bench.Nothing):
@@ -380,6 +381,27 @@ def test_another_name_of_the_strut_changes_the_name_only(case):
     other = diagnose(kind_of(case).model(strut="front.left"), [train], [test]).diagnosis
     same_answer(answer(case).diagnosis, other, rel=1e-9)
     assert {effect.strut for effect in other.effects} == {"front.left"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case", ["stop", *(pytest.param(c, marks=pytest.mark.long) for c in ("friction", "complete"))]
+)
+def test_the_sampling_rate_changes_nothing(case):
+    """Of one record at 1000 Hz, each second, fourth and tenth sample."""
+    train, test = (
+        bench.run(EFFECTS[case], seed=seed, duration_s=seconds, rate_hz=1000, start=start)
+        for seed, seconds, start in ((1, 10.0, None), (2, 6.0, 0.37))
+    )
+    whole, *others = (
+        diagnose(bench.model(), [thinned(train, every)], [thinned(test, every)]).diagnosis
+        for every in (1, 2, 4, 10)
+    )
+    for other in others:
+        same_names(whole, other)
+        for one, thin in zip(whole.effects, other.effects, strict=True):
+            shown = effect(one.name).shown
+            assert all(overlap(one.parameters[name], thin.parameters[name]) for name in shown)
 
 
 # --- 5. Idempotence ----------------------------------------------------------------------------
