@@ -74,6 +74,7 @@ _RIGHT, _PARTED = 100.0, 1e3
 """Mean square of a residual up to which a regression promises a nearly right model, and times that
 from which on the fit of its free run has parted from the measurement: what a model lacks is
 amplified by less."""
+_REMEMBERING = {"friction", "hysteresis"}
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -427,7 +428,7 @@ class Pool:
             return False
         if (
             larger.size > smaller.size
-            and self.is_formula(smaller)
+            and (self.is_formula(smaller) or _adds_an_imitator(smaller, larger))
             and not _adds_a_kind(smaller, larger)
             and not self.is_imitated(larger, smaller)
             and not self.adds_dry_friction(smaller, larger)
@@ -519,6 +520,15 @@ def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
     return few < many and (
         (old <= STORING and new <= DISSIPATING) or (old <= DISSIPATING and new <= STORING)
     )
+
+
+def _adds_an_imitator(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
+    """Whether friction is added to hysteresis, or the other way round.
+
+    Each is a force that remembers where the motion turned: the one corrects the other's formula.
+    """
+    few, many = set(smaller.families) & _REMEMBERING, set(larger.families) & _REMEMBERING
+    return few < many == _REMEMBERING and bool(few)
 
 
 class Ratio(NamedTuple):
