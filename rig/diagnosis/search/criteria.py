@@ -120,6 +120,8 @@ STORING = {"nonlinear_stiffness", "backlash"}
 DISSIPATING = {"nonlinear_damping", "friction", "fade"}
 """Families with which a damper dissipates energy; bristles store a little. They hardly imitate
 those that store it; stops that damp, hysteresis, delays, hidden masses and forces over time do."""
+REMEMBERING = {"friction", "hysteresis"}
+"""Families whose force depends on where the motion turned; their formulas imitate each other."""
 
 CRITERIA = SelectionCriteria()
 """The criteria of `rig diagnose`."""

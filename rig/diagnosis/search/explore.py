@@ -6,7 +6,6 @@ References:
     Letters 15 (1994): the search continues at once from what lowers the residual most.
 """
 
-import sys
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
@@ -242,13 +241,13 @@ def _expand_in_simulation(
 def _plainest_first(changes: Sequence[ModelChange], at_floor: float) -> list[ModelChange]:
     """Changes that promise the noise floor, with the fewest parameters first; then the others.
 
-    A linearisation does not tell formulas apart that are all as good as the noise lets them be.
+    A linearisation cannot distinguish formulas that are all as good as the noise permits.
     """
 
-    def order(change: ModelChange) -> tuple[int, float]:
-        if change.cost < at_floor:
-            return len(change.model.parts.effects), change.cost
-        return sys.maxsize, change.cost
+    def order(change: ModelChange) -> tuple[bool, int, float]:
+        is_at_floor = change.cost < at_floor
+        parameters = len(change.model.parts.effects) if is_at_floor else 0
+        return not is_at_floor, parameters, change.cost
 
     return sorted(changes, key=order)
 

@@ -40,7 +40,12 @@ from rig.diagnosis.problem.problem import (
 )
 from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.progress import Progress, no_progress
-from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
+from rig.diagnosis.search.criteria import (
+    DISSIPATING,
+    REMEMBERING,
+    STORING,
+    SelectionCriteria,
+)
 from rig.diagnosis.search.fit import Fit, fit, validation_costs
 from rig.diagnosis.search.score_test import ModelChange, find_changes
 from rig.diagnosis.search.screen import (
@@ -74,7 +79,6 @@ _RIGHT, _PARTED = 100.0, 1e3
 """Mean square of a residual up to which a regression promises a nearly right model, and times that
 from which on the fit of its free run has parted from the measurement: what a model lacks is
 amplified by less."""
-_REMEMBERING = {"friction", "hysteresis"}
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -449,15 +453,12 @@ class Pool:
 
     def at_floor(self, model: ValidatedModel) -> bool:
         """Whether a model is at the noise floor, so that a law could explain nothing more."""
-        first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
-        share = later if model.size else first
-        return model.cost < self._highest_at_floor(model, share)
+        return model.cost < self.highest_at_floor(model)
 
     def highest_at_floor(self, model: ValidatedModel) -> float:
-        """Sum of squares below which a model with laws is at the floor, by that of a near one."""
-        return self._highest_at_floor(model, self.criteria.least_above_noise_later)
-
-    def _highest_at_floor(self, model: ValidatedModel, share: float) -> float:
+        """Sum of squares below which a model is at the noise floor."""
+        first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
+        share = later if model.size else first
         share += self.criteria.scatter * math.sqrt(2.0 / model.fit.rows)
         return (1.0 + share) * self.floor(model)
 
@@ -485,7 +486,7 @@ class Pool:
         Beside friction or hysteresis, which act there themselves, it corrects their formula.
         """
         few, many = Counter(smaller.families), Counter(larger.families)
-        acts_there = not {"friction", "hysteresis"}.isdisjoint(few)
+        acts_there = not REMEMBERING.isdisjoint(few)
         if many - few != Counter(["friction"]) or few - many or acts_there:
             return False
         (row,) = (row for row, name in new_laws(larger.fit) if effect(name).family == "friction")
@@ -523,12 +524,8 @@ def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
 
 
 def _adds_an_imitator(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
-    """Whether friction is added to hysteresis, or the other way round.
-
-    Each is a force that remembers where the motion turned: the one corrects the other's formula.
-    """
-    few, many = set(smaller.families) & _REMEMBERING, set(larger.families) & _REMEMBERING
-    return few < many == _REMEMBERING and bool(few)
+    """Whether friction is added to hysteresis, or vice versa: each corrects the other's formula."""
+    return set(larger.families) >= REMEMBERING and len(REMEMBERING & set(smaller.families)) == 1
 
 
 class Ratio(NamedTuple):
