@@ -64,6 +64,15 @@ def test_what_happens_once_may_be_chance():
     assert not gains(error_ratio(without, law, 1e-3)).is_by_chance
 
 
+def test_a_block_that_gains_most_does_not_hide_what_all_others_gain():
+    law, without = draw(np.random.default_rng(4), 3.0)
+    alone = error_ratio(without, law, 1e-4)
+    without.block_costs[7] *= 1000.0
+    ratio = error_ratio(without, law, 1e-4)
+    assert not gains(ratio).is_by_chance
+    assert ratio.value == pytest.approx(alone.value, rel=0.01)
+
+
 @pytest.mark.slow
 def test_at_a_level_that_no_data_reach_nothing_is_named():
     runs = [bench.run(Hardening(), seed=seed) for seed in (1, 2)]

@@ -540,14 +540,24 @@ def error_ratio(other: ValidatedModel, best: ValidatedModel, level: float) -> Ra
     """RMS residual of a model over that of another; beyond each end with a probability of `level`.
 
     The scatter is that of the logarithm when each block is left out (jackknife): a stop that is
-    reached in few blocks makes the sums of squares scatter as much as they differ.
+    reached in few blocks makes the sums of squares scatter as much as they differ. Where one block
+    has all but all of them, nothing remains to estimate a scatter by: without that in which the
+    other model is worst, the ratio is less than it is, and the interval taken if it lies higher.
     """
-    costs = [model.cost - model.block_costs for model in (other, best)]
-    logs = 0.5 * np.log(np.maximum(costs[0], _TINY) / np.maximum(costs[1], _TINY))
+    most = int(np.argmax(other.block_costs - best.block_costs))
+    kept = np.arange(len(best.block_costs)) != most
+    costs = other.block_costs, best.block_costs
+    ratios = _jackknife(*costs, level), _jackknife(*(cost[kept] for cost in costs), level)
+    return max(ratios, key=lambda ratio: ratio.low)
+
+
+def _jackknife(other: Array, best: Array, level: float) -> Ratio:
+    left_out = [np.maximum(cost.sum() - cost, _TINY) for cost in (other, best)]
+    logs = 0.5 * np.log(left_out[0] / left_out[1])
     blocks = len(logs)
     error = float(np.sqrt((blocks - 1) * np.var(logs)))
     half = float(student.isf(level, blocks - 1)) * error
-    value = float(np.sqrt(other.cost / best.cost))
+    value = float(np.sqrt(other.sum() / best.sum()))
     return Ratio(value, value * math.exp(-half), value * math.exp(half))
 
 
