@@ -546,9 +546,9 @@ def error_ratio(other: ValidatedModel, best: ValidatedModel, level: float) -> Ra
     """
     most = int(np.argmax(other.block_costs - best.block_costs))
     kept = np.arange(len(best.block_costs)) != most
-    costs = other.block_costs, best.block_costs
-    ratios = _jackknife(*costs, level), _jackknife(*(cost[kept] for cost in costs), level)
-    return max(ratios, key=lambda ratio: ratio.low)
+    whole = _jackknife(other.block_costs, best.block_costs, level)
+    without = _jackknife(other.block_costs[kept], best.block_costs[kept], level)
+    return max(whole, without, key=lambda ratio: ratio.low)
 
 
 def _jackknife(other: Array, best: Array, level: float) -> Ratio:
