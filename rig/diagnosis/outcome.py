@@ -16,7 +16,7 @@ from rig.files.json_text import json_text
 Array = NDArray[np.float64]
 Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
 Change = Literal["refitted", "superfluous"]
-Confirmation = Literal["confirmed", "not_exercised", "contradicted"]
+Confirmation = Literal["confirmed", "unsettled", "not_exercised", "contradicted"]
 
 IMPROBABLE = 4.0
 """Standard deviations of the model file's values beyond which one in some ten thousand lies."""
@@ -117,8 +117,9 @@ class Evidence:
         without: Gain over the best model of the other effects.
         rival: Gain over the best model with no effect of its family in its strut, but with others;
             None where none was fitted.
-        held_out: ``confirmed``; ``not_exercised``: the effect would not show there;
-            ``contradicted``: it would, and the data are as well described without it.
+        held_out: ``confirmed``; ``unsettled``: it gains there, but the model leaves so much that it
+            may stand in for what is still missing; ``not_exercised``: the effect would not show
+            there; ``contradicted``: it would, and the data are as well described without it.
         held_out_log_likelihood: Gain by it on the held-out data, the linear part being free.
     """
 
@@ -177,7 +178,7 @@ class FoundEffect:
 
     @property
     def is_candidate(self) -> bool:
-        """Whether held-out data do not confirm it."""
+        """Whether held-out data leave open that it is missing."""
         return self.evidence is not None and self.evidence.held_out != "confirmed"
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rig.diagnosis.evaluate import HeldOutLaw
-from rig.diagnosis.outcome import Confirmation, ModelErrors, Verdict
+from rig.diagnosis.outcome import Confirmation, Verdict
 from rig.diagnosis.problem.problem import (
     Problem,
     RunEvaluation,
@@ -28,6 +28,32 @@ def confirmation(law: HeldOutLaw, criteria: SelectionCriteria) -> Confirmation:
     return "confirmed" if law.gain > 0.0 else "contradicted"
 
 
+def confirmations(
+    evaluations: Sequence[RunEvaluation],
+    search: SearchResult,
+    laws: HeldOutLaws,
+    criteria: SelectionCriteria,
+) -> dict[StrutEffect, Confirmation]:
+    """What held-out data show of each law of the chosen model.
+
+    Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
+    it whatever it is: at most the one that the data need most is confirmed.
+    """
+    found: dict[StrutEffect, Confirmation] = {
+        law: confirmation(it, criteria) for law, it in laws.items()
+    }
+    ratios = [run.target.after / max(run.target_floor, 1e-300) for run in evaluations]
+    if quadratic_mean(ratios) <= criteria.settled:
+        return found
+    settled: set[StrutEffect] = set()
+    if search.evidence and _share_left(evaluations, criteria) < criteria.leading:
+        gains = {law: it.without.log_likelihood for law, it in search.evidence.items()}
+        settled.add(max(gains, key=gains.__getitem__))
+    for law in {law for law, it in found.items() if it == "confirmed"} - settled:
+        found[law] = "unsettled"
+    return found
+
+
 def find_reason_against_laws(
     problem: Problem,
     linear: Fit,
@@ -45,9 +71,9 @@ def find_reason_against_laws(
     if not any(confirmation(law, criteria) != "not_exercised" for law in laws.values()):
         return None
     errors = quadratic_means([run.target for run in evaluations])
-    if errors.after < errors.linear or _reduces_force(evaluations, errors, criteria):
+    if errors.after < errors.linear or _explain_partly(evaluations, criteria):
         return None
-    ratio = errors.after / max(errors.linear, 1e-300)
+    ratio = _divide(errors.after, errors.linear)
     return (
         "taken back: the error on held-out data is no less than that of the best linear model "
         f"({ratio:.3g} times)"
@@ -73,18 +99,27 @@ def _is_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> 
     return result.mean_square <= criteria.explained**2 * floor
 
 
-def _reduces_force(
-    evaluations: Sequence[RunEvaluation], errors: ModelErrors, criteria: SelectionCriteria
-) -> bool:
-    """Whether laws reduce the residual force by a good share, heights being about as good.
+def _explain_partly(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria) -> bool:
+    """Whether laws reduce the error of the best linear model by a good share."""
+    return _share_left(evaluations, criteria) < 1.0 - criteria.partly
 
-    Where heights drift, as those of an axis without a spring do, the force decides.
+
+def _share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria) -> float:
+    """Share of the best linear model's error that is left.
+
+    Where heights drift, as those of an axis without a spring do, the force decides, heights being
+    about as good.
     """
+    errors = quadratic_means([run.target for run in evaluations])
+    share = _divide(errors.after, errors.linear)
+    if share >= criteria.explained:
+        return share
     force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
-    return (
-        force.after < (1.0 - criteria.partly) * force.linear
-        and errors.after < criteria.explained * errors.linear
-    )
+    return min(share, _divide(force.after, force.linear))
+
+
+def _divide(after: float, linear: float) -> float:
+    return after / max(linear, 1e-300)
 
 
 def find_verdict(
@@ -110,9 +145,7 @@ def find_verdict(
         is_any_confirmed = any(confirmation(law, criteria) == "confirmed" for law in laws.values())
         is_certain = not search.rivals and (is_any_confirmed or not laws)
         return "explained" if is_certain else "ambiguous"
-    if chosen.candidate.new and all(np.isfinite(ratios)):
-        errors = quadratic_means([run.target for run in evaluations])
-        is_less = errors.after < (1.0 - criteria.partly) * errors.linear
-        if is_less or _reduces_force(evaluations, errors, criteria):
-            return "partly_explained"
+    is_finite = all(np.isfinite(ratios))
+    if chosen.candidate.new and is_finite and _explain_partly(evaluations, criteria):
+        return "partly_explained"
     return "not_explained"

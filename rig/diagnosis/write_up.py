@@ -58,7 +58,7 @@ from rig.diagnosis.search.fit import (
     spread_over,
 )
 from rig.diagnosis.search.model_selection import SearchResult
-from rig.diagnosis.verdict import HeldOutLaws, confirmation
+from rig.diagnosis.verdict import HeldOutLaws, confirmations
 from rig.recordings.stretches import find_stretches
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def compose_result(
     diagnosis = Diagnosis(
         verdict,
         linear_corrections(problem, estimates),
-        _effects(problem, estimates, after, _evidence(search, laws, criteria))
+        _effects(problem, estimates, after, _evidence(search, evaluations, laws, criteria))
         + _linear_effects(problem, estimates, after, channels),
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
@@ -274,11 +274,15 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
 
 
 def _evidence(
-    search: SearchResult, laws: HeldOutLaws, criteria: SelectionCriteria
+    search: SearchResult,
+    evaluations: Sequence[RunEvaluation],
+    laws: HeldOutLaws,
+    criteria: SelectionCriteria,
 ) -> dict[StrutEffect, Evidence]:
     """The evidence for each chosen law."""
+    shown = confirmations(evaluations, search, laws, criteria)
     return {
-        law: Evidence(*search.evidence[law], confirmation(found, criteria), 0.5 * found.gain)
+        law: Evidence(*search.evidence[law], shown[law], 0.5 * found.gain)
         for law, found in laws.items()
         if law in search.evidence
     }

@@ -1,15 +1,24 @@
 """What held-out data say of the laws of a model, and which laws they take back."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.evaluate import HeldOutLaw
-from rig.diagnosis.outcome import HeldOut, ModelErrors, NoiseFloor, RunFigures
+from rig.diagnosis.outcome import (
+    Estimate,
+    HeldOut,
+    LikelihoodGain,
+    ModelErrors,
+    NoiseFloor,
+    RunFigures,
+)
 from rig.diagnosis.problem.problem import RunEvaluation
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.verdict import confirmation, find_reason_against_laws
+from rig.diagnosis.search.evidence import LeftOutGains
+from rig.diagnosis.verdict import confirmation, confirmations, find_reason_against_laws
 from rig.diagnosis.write_up import notes_of_opposite_errors
 from tests.diagnosis import little_bench as bench
 
@@ -55,10 +64,15 @@ class Learnt:
         return 1.0
 
 
-def reason(after_m, linear_m, laws, after_n=1.0, linear_n=1.0):
+def evaluation(after_m, linear_m, after_n=1.0, linear_n=1.0):
     heights = ModelErrors(5e-3, linear_m, after_m, 1e-2)
     forces = ModelErrors(5.0, linear_n, after_n, 10.0)
-    run = RunEvaluation(RunFigures("run", heights, forces, None), NoiseFloor(FLOOR_M, 0.1), 0.0, ())
+    figures = RunFigures("run", heights, forces, None)
+    return RunEvaluation(figures, NoiseFloor(FLOOR_M, 0.1), 0.0, ())
+
+
+def reason(after_m, linear_m, laws, after_n=1.0, linear_n=1.0):
+    run = evaluation(after_m, linear_m, after_n, linear_n)
     return find_reason_against_laws(Learnt(), Fitted(), [run], laws, CRITERIA)
 
 
@@ -76,6 +90,44 @@ def test_laws_that_held_out_data_do_not_exercise_lose_nothing():
 def test_where_heights_drift_the_force_decides():
     assert reason(1.1e-3, 1e-3, {LAW: CONFIRMED}, after_n=0.5) is None
     assert reason(1.3e-3, 1e-3, {LAW: CONFIRMED}, after_n=0.5) is not None
+
+
+MORE, OTHER = (0, "end_stops"), (0, "backlash")
+
+
+def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW)):
+    """What held-out data show of laws that they confirm, of which they need the first one most."""
+
+    evidence = {
+        law: LeftOutGains(LikelihoodGain((), gain, Estimate(2.0, 1.9, 2.1)), None)
+        for law, gain in zip(laws, (9e5, 3e4, 2e3), strict=False)
+    }
+    found = confirmations(
+        [evaluation(after_m, linear_m)],
+        SimpleNamespace(evidence=evidence),
+        dict.fromkeys(laws, CONFIRMED),
+        CRITERIA,
+    )
+    return [found[law] for law in laws]
+
+
+def test_near_the_floor_all_that_held_out_data_confirm_are_named():
+    assert shown(9.0 * FLOOR_M) == ["confirmed"] * 3
+
+
+def test_far_above_the_floor_only_the_law_that_data_need_most_is_named():
+    assert shown(40.0 * FLOOR_M) == ["confirmed", "unsettled", "unsettled"]
+    assert shown(40.0 * FLOOR_M, laws=(OTHER,)) == ["confirmed"]
+
+
+def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
+    assert shown(40.0 * FLOOR_M, linear_m=1.5e-3) == ["unsettled"] * 3
+
+
+def test_what_held_out_data_do_not_exercise_stays_so_far_above_the_floor():
+    search = SimpleNamespace(evidence={})
+    found = confirmations([evaluation(1e-3, 0.1)], search, {LAW: IDLE}, CRITERIA)
+    assert found == {LAW: "not_exercised"}
 
 
 @pytest.fixture(scope="module")

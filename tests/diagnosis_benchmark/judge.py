@@ -1,7 +1,7 @@
 """Holds a diagnosis against the truth."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from tests.diagnosis_benchmark.acting import overlaps
@@ -46,6 +46,7 @@ class Result:
         ambiguous_with: Rivals it could not tell apart.
         right: Whether it is right, see `is_right`.
         false_names: Families it names that are not there, see `false_names`.
+        false_candidates: Families it calls candidates that are not there, likewise.
         unbound: Effects it names that the data do not bind, see `is_unbound`.
         unit: ``m`` or ``N``, of the next four.
         error_before: Held-out error of the nominal model: open-loop height, on a dyno strut force.
@@ -78,6 +79,7 @@ class Result:
     ambiguous_with: tuple[str, ...]
     right: bool
     false_names: tuple[str, ...]
+    false_candidates: tuple[str, ...]
     unbound: tuple[str, ...]
     unit: str
     error_before: float
@@ -113,7 +115,7 @@ def _without(families: Iterable[str], left_out: Iterable[str]) -> list[str]:
 
 
 def is_right(planted: tuple[str, ...], diagnosis: dict, *, is_rough: bool = False) -> bool:
-    """Whether a diagnosis is right.
+    """Whether a diagnosis is right; what it calls a candidate counts as told.
 
     Nothing planted: it says so; where the model file is rough, it names linear corrections at most,
     and does not say that anything is residual_of.
@@ -144,16 +146,28 @@ def is_right(planted: tuple[str, ...], diagnosis: dict, *, is_rough: bool = Fals
     return set(planted) <= {*families, *linear} | rivals
 
 
-def false_names(planted: tuple[str, ...], diagnosis: dict, *, is_rough: bool) -> list[str]:
+def is_candidate(effect: dict) -> bool:
+    """Whether a diagnosis calls an effect a candidate."""
+    evidence = effect.get("evidence")
+    return evidence is not None and evidence["held_out"] != "confirmed"
+
+
+def false_names(
+    planted: tuple[str, ...],
+    diagnosis: dict,
+    *,
+    is_rough: bool,
+    counted: Callable[[dict], bool] = lambda effect: not is_candidate(effect),
+) -> list[str]:
     """Families that a diagnosis names with an interval and that are not there.
 
-    A linear family is none where it is a linear correction, nor the surface that names no cause.
-    Where a planted family is told as a rival, what was named in its place is none.
+    A linear family is none where it is a linear correction, nor the surface that names no cause,
+    nor a candidate. Where a planted family is told as a rival, what was named in its place is none.
     """
     linear = set(LINEAR_FAMILIES if is_rough else linear_families(diagnosis))
     named = [
         effect["family"]
-        for effect in diagnosis["effects"]
+        for effect in filter(counted, diagnosis["effects"])
         if any(is_bounded(estimate) for estimate in effect["parameters"].values())
     ]
     wrong = _without(named, {*planted, *linear, NO_CAUSE})
@@ -230,6 +244,9 @@ def judge(
         "ambiguous_with": tuple(diagnosis["ambiguous_with"]),
         "right": is_right(case.families, diagnosis, is_rough=is_rough),
         "false_names": tuple(false_names(case.families, diagnosis, is_rough=is_rough)),
+        "false_candidates": tuple(
+            false_names(case.families, diagnosis, is_rough=is_rough, counted=is_candidate)
+        ),
         "unbound": tuple(effect["name"] for effect in found if is_unbound(effect)),
         "intervals": tuple(intervals(case, diagnosis)),
         "overlaps": () if is_moving else tuple(overlaps(case, diagnosis)),

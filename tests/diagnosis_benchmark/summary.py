@@ -66,7 +66,7 @@ A case counts as right if
   the family of the effect first (a preload that accompanies a stiffness is not counted before it;
   with a rough nominal model, the first family that is not linear counts),
 - or several effects are planted, the verdict is one of these, and all of their families are named,
-  as effects or as linear corrections,
+  as effects (candidates included) or as linear corrections,
 - or the verdict is `ambiguous`, and the planted families are named in this way or listed as rivals,
 - or nothing is planted, and the verdict is `nothing_missing`, or, with a rough nominal model, at
   most linear corrections are named and the verdict is not `not_explained`,
@@ -76,8 +76,9 @@ A case counts as right if
 The held-out error of an `explained` case is compared with {EXPLAINED_MULTIPLE} times that of a
 right model (on a dyno, with {EXPLAINED_MULTIPLE} times the noise floor that the diagnosis reports).
 *False names* is the share of cases in which a family is named that was not planted, with at least
-one identifiable parameter (linear corrections, such as another stiffness, do not count); *not
-bound* is the share of cases in which the data do not exclude that a named effect has the size zero.
+one identifiable parameter (linear corrections, such as another stiffness, do not count); *false
+candidates* is the share of cases in which the report calls such a family a candidate; *not bound*
+is the share of cases in which the data do not exclude that a named effect has the size zero.
 Each share is given with its 95 % Wilson interval. The intervals of parameters are counted only in
 cases that are right. A case may have several of them; the Wilson interval of their share assumes
 that they are independent, and may be too narrow. *F1 of the range in which it acts* is the overlap
@@ -156,6 +157,7 @@ def figures(results: list[Result]) -> dict[str, object]:
         "cases": len(results),
         "right": rate(result.right for result in results),
         "false_names": rate(bool(result.false_names) for result in results),
+        "false_candidates": rate(bool(result.false_candidates) for result in results),
         "unbound": rate(bool(result.unbound) for result in results),
         "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
         "explained_worst": _percentile(explained, 100),
@@ -221,6 +223,7 @@ def _entries(results: list[Result], shown: Callable[[Result], bool]) -> list[dic
             "linear": result.linear,
             "ambiguous_with": result.ambiguous_with,
             "false_names": result.false_names,
+            "false_candidates": result.false_candidates,
             "unbound": result.unbound,
             "over_floor": result.floor_multiple if math.isfinite(result.floor_multiple) else None,
             "message": result.message,
@@ -250,6 +253,7 @@ COLUMNS = (
     Column("cases", lambda found: str(found["cases"])),
     Column("right", lambda found: str(found["right"])),
     Column("false names", lambda found: str(found["false_names"])),
+    Column("false candidates", lambda found: str(found["false_candidates"])),
     Column("not bound", lambda found: str(found["unbound"])),
     Column(f"`explained` within {EXPLAINED_MULTIPLE} noise floors", _explained),
     Column("95 % intervals that contain the truth", lambda found: f"{found['coverage']}"),
@@ -383,7 +387,8 @@ def write_tables(results: list[Result], summary: dict, out: Path) -> None:
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
     (out / "table.md").write_text(markdown(summary), encoding="utf-8")
     columns = ("slot", "case", "planted", "laws", "ratios", "is_rough", "verdict", "names")
-    columns += ("linear", "ambiguous_with", "right", "false_names", "unbound", "unit")
+    columns += ("linear", "ambiguous_with", "right", "false_names", "false_candidates", "unbound")
+    columns += ("unit",)
     columns += ("error_before", "error_after", "floor", "own_floor", "duration_s", "message")
     with (out / "cases.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)

@@ -21,7 +21,14 @@ from tests.diagnosis_benchmark.execute import (
     result_path,
     within,
 )
-from tests.diagnosis_benchmark.judge import Result, false_names, is_right, is_unbound, judge
+from tests.diagnosis_benchmark.judge import (
+    Result,
+    false_names,
+    is_candidate,
+    is_right,
+    is_unbound,
+    judge,
+)
 from tests.diagnosis_benchmark.live import live_force
 from tests.diagnosis_benchmark.plan import GROUPS, Slot, fill, part_of, slots
 from tests.diagnosis_benchmark.summary import (
@@ -131,6 +138,16 @@ def test_rough_models_are_right_in_what_is_not_linear(planted, answer, right):
 )
 def test_false_names_are_what_is_not_there(answer, is_rough, wrong):
     assert false_names(("friction",), answer, is_rough=is_rough) == wrong
+
+
+def test_a_candidate_that_is_not_there_is_counted_apart():
+    answer = diagnosis("partly_explained", "friction", "stop")
+    answer["effects"][1]["evidence"] = {"held_out": "unsettled"}
+    assert false_names(("friction",), answer, is_rough=False) == []
+    counted = false_names(("friction",), answer, is_rough=False, counted=is_candidate)
+    assert counted == ["stop"]
+    answer["effects"][1]["evidence"] = {"held_out": "confirmed"}
+    assert false_names(("friction",), answer, is_rough=False) == ["stop"]
 
 
 def test_names_without_any_interval_are_not_counted_as_false():

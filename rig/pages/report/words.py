@@ -49,6 +49,7 @@ _OF_CHANNELS = {"delay_s": "delay", "gain": "input_gain"}
 
 CONFIRMATIONS = {
     "confirmed": "held-out data confirm it",
+    "unsettled": "held-out data gain by it, but far more than noise is left, which it may imitate",
     "not_exercised": "held-out data do not exercise it",
     "contradicted": "held-out data contradict it",
 }
