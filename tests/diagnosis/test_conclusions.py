@@ -60,4 +60,4 @@ def test_friction_that_weakens_with_speed_makes_no_damper_that_pushes():
     assert found.effects[0].family in {"friction", "hysteresis"}
     assert correction(found, "damping_n_s_per_m").total.value == 0.0
     error = found.held_out.strut_force_rmse_n
-    assert error.after < 0.15 * error.before
+    assert error.after < 0.25 * error.before

@@ -14,7 +14,7 @@ References:
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from os import cpu_count
@@ -125,6 +125,13 @@ class Begin(NamedTuple):
     most_level: float = np.inf
     promised: float = np.inf
 
+    @property
+    def key(self) -> Hashable:
+        """What fits that begin alike have in common."""
+        candidate, parts = self.model
+        arrays = parts.linear, parts.effects, *parts.starts
+        return candidate, self.most_level, self.promised, tuple(it.tobytes() for it in arrays)
+
 
 class Pool:
     """Fitted models by candidate; of two fits of one candidate the better is kept.
@@ -144,6 +151,7 @@ class Pool:
         self.converged: set[Candidate] = set()
         self.floors: dict[Candidate, tuple[ValidatedModel, float]] = {}
         self.tested: dict[Candidate, tuple[ValidatedModel, tuple[ModelChange, ...]]] = {}
+        self.begun: set[Hashable] = set()
         self.attempt_all([seed.model for seed in seeds])
         base = nominal(problem)
         self.linear = self.fits.setdefault(base, self.validate(given))
@@ -232,7 +240,14 @@ class Pool:
                     self._keep(candidate, model)
 
     def _fit_from(self, begin: Begin, effort: Effort) -> Fit | None:
-        """Fit a model in free run; where that parts, once more from a model that is let go."""
+        """Fit a model in free run; where that parts, once more from a model that is let go.
+
+        None, too, where a fit began there before: its result is known.
+        """
+        key = begin.key, effort
+        if key in self.begun:
+            return None
+        self.begun.add(key)
         result = self._refit(self.problem, begin, effort)
         parted = result is None or result.mean_square > _PARTED * begin.promised
         if begin.promised > _RIGHT or not parted or not self.held:
