@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.interpolate import CubicSpline
 
 from dart_model.spec import ModelSpec
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE
@@ -120,11 +120,11 @@ def gains_of(parameters: Sequence[LinearParameter], changes: Array, struts: int)
 
 
 def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array) -> Array:
-    """Columns (N, k) as they are seen with a delay (s) each, shape (k,).
+    """Columns (N, k, ...) as they are seen with a delay (s) each, shape (k,).
 
-    Between times they are cubic, through their rates of change (N, k) where these are given; before
-    and after them they go on at these rates, else they stay. (A motion that stops dead at its end
-    has a bend there, which no smoothing takes for noise.)
+    Between times they are cubic, through their rates of change (N, k, ...) where these are given;
+    before and after them they go on at these rates, else they stay. (A motion that stops dead at
+    its end has a bend there, which no smoothing takes for noise.)
     """
     late = values
     for column, delay_s in enumerate(delays_s.tolist()):
@@ -132,15 +132,39 @@ def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array
             continue
         if late is values:
             late = values.copy()
-        own = np.ascontiguousarray(values[:, column])
-        known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
         if rates is None:
-            late[:, column] = CubicSpline(t_s, own)(known_s)
+            known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
+            late[:, column] = CubicSpline(t_s, values[:, column])(known_s)
         else:
-            rate = np.ascontiguousarray(rates[:, column])
-            beyond = (t_s - delay_s - known_s) * np.where(known_s > t_s[0], rate[-1], rate[0])
-            late[:, column] = CubicHermiteSpline(t_s, own, rate)(known_s) + beyond
+            late[:, column] = _read_hermite(t_s, values[:, column], rates[:, column], delay_s)
     return late
+
+
+def _read_hermite(t_s: Array, values: Array, rates: Array, delay_s: float) -> Array:
+    """Values (N, ...) before a delay: Hermite's cubic by their rates, which go on beyond the ends.
+
+    Own lines instead of `scipy.interpolate.CubicHermiteSpline`, which builds each column anew: a
+    third of the time of a fit's derivatives.
+    """
+    known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
+    first = np.clip(np.searchsorted(t_s, known_s, side="right") - 1, 0, len(t_s) - 2)
+    step_s = t_s[first + 1] - t_s[first]
+    share = (known_s - t_s[first]) / step_s
+    beyond_s = t_s - delay_s - known_s
+    rest = 1.0 - share
+    weights = (
+        rest**2 * (1.0 + 2.0 * share),
+        share**2 * (1.0 + 2.0 * rest),
+        step_s * share * rest**2 + np.minimum(beyond_s, 0.0),
+        -step_s * rest * share**2 + np.maximum(beyond_s, 0.0),
+    )
+    by_row = [weight.reshape(-1, *[1] * (values.ndim - 1)) for weight in weights]
+    return (
+        by_row[0] * values[first]
+        + by_row[1] * values[first + 1]
+        + by_row[2] * rates[first]
+        + by_row[3] * rates[first + 1]
+    )
 
 
 def known_share(t_s: Array, delays_s: Array) -> Array:

@@ -7,7 +7,7 @@ as it is: an equation error that passes through the model's own dynamics has the
 error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -410,12 +410,12 @@ class FreeRunProblem(Problem):
             return None
         if not all(np.all(np.isfinite(part)) for part in tangents):
             return None
-        columns = np.empty((int(run.grid.fitted.sum()) * len(self.noise_m), int(varied.sum())))
         whitened = self._whiten_tangents(k, model, tangents)
-        for i, column in enumerate(np.flatnonzero(varied).tolist()):
-            if column in simulated:
-                columns[:, i] = whitened(simulated[column])
-            else:
+        wanted: list[int] = np.flatnonzero(varied).tolist()
+        order = [simulated.get(column, 0) for column in wanted]
+        columns = whitened if order == list(range(directions.columns)) else whitened[:, order]
+        for i, column in enumerate(wanted):
+            if column not in simulated:
                 changed = self._difference(k, model, motion, column)
                 if changed is None:
                     return None
@@ -428,24 +428,17 @@ class FreeRunProblem(Problem):
         late = bool(np.any(self._delays(model).struts))
         return Tangents(np.empty(shape), np.empty(shape if late else (0, *shape[1:])))
 
-    def _whiten_tangents(
-        self, k: int, model: CandidateModel, tangents: Tangents
-    ) -> Callable[[int], Array]:
-        """Derivative of the residual, shape (m,), of a column of a motion's derivatives."""
+    def _whiten_tangents(self, k: int, model: CandidateModel, tangents: Tangents) -> Array:
+        """Derivatives of the residual, shape (m, columns), by those of a motion."""
         grid, delays_s = self.runs[k].grid, self._delays(model).struts
-        weight = self._gains(model) / self.noise_m
-        late = bool(np.any(delays_s))
-        if late:
-            weight = weight * known_share(grid.t_s, delays_s)[grid.fitted]
-
-        def whiten(column: int) -> Array:
-            heights = np.ascontiguousarray(tangents.heights[:, :, column])
-            if late:
-                rates = np.ascontiguousarray(tangents.velocities[:, :, column])
-                heights = late_columns(grid.t_s, heights, rates, delays_s)
-            return -(heights[grid.fitted] * weight).ravel()
-
-        return whiten
+        weight, heights = self._gains(model) / self.noise_m, tangents.heights
+        if np.any(delays_s):
+            weight = weight * known_share(grid.t_s, delays_s)
+            heights = late_columns(grid.t_s, heights, tangents.velocities, delays_s)
+        columns = heights * -weight[..., None]
+        if not grid.fitted.all():
+            columns = columns[grid.fitted]
+        return columns.reshape(-1, columns.shape[-1])
 
     def law_responses(
         self, k: int, model: CandidateModel, laws: Sequence[tuple[StrutEffect, Array]]
@@ -463,8 +456,7 @@ class FreeRunProblem(Problem):
         slots = slots_of(self, model.candidate)
         if not differentiate(slots, *pushed, self._empty_motion(run), tangents):
             return None
-        whitened = self._whiten_tangents(k, model, tangents)
-        return np.column_stack([whitened(column) for column in range(len(laws))])
+        return self._whiten_tangents(k, model, tangents)
 
     def _difference(
         self, k: int, model: CandidateModel, motion: Trajectory, parameter: int

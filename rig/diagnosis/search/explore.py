@@ -228,12 +228,15 @@ def _expand_in_simulation(
     model = pool.fits[candidate]
     least = model.fit.solution.cost - pool.criteria.least_likelihood_gain
     known = {c: fitted.fit.solution.cost for c, fitted in pool.fits.items()}
+    at_floor = pool.highest_at_floor(model)
     changes = [
         change
         for change in pool.changes(model)
         if change.cost < min(least, known.get(change.model.candidate, least))
+        # A model that the linearisation shows at the floor lacks a better fit or formula, no law.
+        and (change.unchanged > at_floor or not set(base) <= set(change.laws))
     ]
-    changes = _plainest_first(changes, pool.highest_at_floor(model))
+    changes = _plainest_first(changes, at_floor)
     chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size)
     pool.attempt_changes(chosen, within(progress, 0.5, 1.0))
 

@@ -52,10 +52,12 @@ class ModelChange(NamedTuple):
     Attributes:
         model: The changed model, where a fit of it may begin.
         cost: Sum of squares that it would reach, by linearisation about the fitted model.
+        unchanged: The same of the fitted model itself, which a fit need not have reached.
     """
 
     model: CandidateModel
     cost: float
+    unchanged: float = np.inf
 
     @property
     def laws(self) -> tuple[StrutEffect, ...]:
@@ -269,7 +271,7 @@ def _change(
 ) -> ModelChange:
     rest = base.residual - explained
     model = model_for(base.problem, base.fit.model, candidate, {at: values})
-    return ModelChange(model, float(rest @ rest))
+    return ModelChange(model, float(rest @ rest), float(base.residual @ base.residual))
 
 
 def _forces(base: _Base, at: StrutEffect, values: Array) -> Array:
