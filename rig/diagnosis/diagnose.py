@@ -12,7 +12,7 @@ from rig.diagnosis.evaluate import evaluate_held_out, fit_as_given, weigh_on_hel
 from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.numerics.laws import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
-from rig.diagnosis.outcome import Result, Verdict
+from rig.diagnosis.outcome import RejectedEffect, Result, Verdict
 from rig.diagnosis.problem.build import Problems, build_problems, part_of, with_tones
 from rig.diagnosis.problem.problem import (
     CandidateModel,
@@ -140,18 +140,27 @@ def _with_gains(problems: Problems) -> Problems:
 
 
 def _find(problems: Problems, criteria: SelectionCriteria, progress: Progress) -> _Found:
-    """What a search finds, and what held-out data show of it."""
-    search, problem = _search(problems.learnt, criteria, progress)
-    progress("evaluating on held-out data", 0.95)
+    """What a search finds, and what held-out data show of it.
+
+    Laws that held-out data take back give way to the best model of fewer.
+    """
+    explored = _explore(problems.learnt, criteria, progress)
+    problem = explored.last.problem
     held_out = replace(problems.held_out, motions=problem.motions)
     problems = problems._replace(learnt=problem, held_out=held_out)
-    linear = search.linear.fit
-    evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
-    laws = weigh_on_held_out(problems, search.chosen.fit)
-    why = find_reason_against_laws(problem, linear, evaluations, laws, criteria)
-    if search.chosen.size and why:
-        search, laws = search.without_laws(problem, why), {}
+    most_laws, taken_back = criteria.most_laws, list[RejectedEffect]()
+    while True:
+        search = _select(explored, most_laws, progress)
+        progress("evaluating on held-out data", 0.95)
+        linear = search.linear.fit
         evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
+        laws = weigh_on_held_out(problems, search.chosen.fit)
+        why = find_reason_against_laws(problem, linear, evaluations, laws, criteria)
+        if not search.chosen.size or why is None:
+            break
+        taken_back += search.rejections(problem, why)
+        most_laws = search.chosen.size - 1
+    search = search.with_rejected(problem, taken_back)
     verdict = find_verdict(problem, evaluations, search, laws, criteria)
     return _Found(problems, search, evaluations, laws, verdict)
 
@@ -175,38 +184,50 @@ def _error(evaluations: Sequence[RunEvaluation]) -> float:
     return quadratic_mean([run.target.after for run in evaluations])
 
 
-def _search(
-    problem: Problem, criteria: SelectionCriteria, progress: Progress
-) -> tuple[SearchResult, Problem]:
-    """Search, long recordings in pieces, and choose a model on all of them.
+class _Explored(NamedTuple):
+    """Models that were fitted in a search.
 
-    Returns:
-        The result, and the problem with noise and tones as they are known in the end.
+    Attributes:
+        first: Those about the linear model.
+        last: Those about the best model, of all recordings, with noise and tones as they are known
+            in the end.
+        first_round: Single laws along the motion, where they were searched.
     """
+
+    first: Pool
+    last: Pool
+    first_round: FirstRound | None
+
+
+def _explore(problem: Problem, criteria: SelectionCriteria, progress: Progress) -> _Explored:
+    """Search, long recordings in pieces."""
     progress("fitting the linear part", 0.03)
     fits = first_fits(problem)
     problem = _with_residual_noise(problem, fits[1])
     part = part_of(problem, _SEARCHED_NODES)
     quick = problem.coarser(fits[1].model)
     if part is problem:
-        first, last, single = _explore_twice(quick, fits, criteria, within(progress, 0.05, 0.85))
-    else:
-        of_part = first_fits(part)
-        first, last, single = _explore_twice(
-            part.coarser(of_part[1].model), of_part, criteria, within(progress, 0.05, 0.6)
-        )
-        last = _fit_to_all(quick, fits, last, within(progress, 0.6, 0.85))
-    result = select_model(last, first, single, progress)
-    chosen = _refit_with_finer_steps(last.problem, result.chosen)
-    return result._replace(chosen=chosen), last.problem
+        return _explore_twice(quick, fits, criteria, within(progress, 0.05, 0.85))
+    of_part = first_fits(part)
+    explored = _explore_twice(
+        part.coarser(of_part[1].model), of_part, criteria, within(progress, 0.05, 0.6)
+    )
+    last = _fit_to_all(quick, fits, explored.last, within(progress, 0.6, 0.85))
+    return explored._replace(last=last)
+
+
+def _select(explored: _Explored, most_laws: int, progress: Progress) -> SearchResult:
+    """The model that is chosen of those with so many laws at most."""
+    first, last, first_round = explored
+    result = select_model(last, first, first_round, most_laws, progress)
+    return result._replace(chosen=_refit_with_finer_steps(last.problem, result.chosen))
 
 
 def _explore_twice(
     problem: Problem, fits: tuple[Fit, Fit], criteria: SelectionCriteria, progress: Progress
-) -> tuple[Pool, Pool, FirstRound | None]:
+) -> _Explored:
     """Search, and search again about the best model: its free run is nearer to the measurement.
 
-    These are the models about the linear one, those about the best, and the first round.
     The noise, too, is only known once a model is near: the residual of a poor one is smooth.
     """
     given, linear = fits
@@ -216,7 +237,7 @@ def _explore_twice(
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
     explore(second, within(progress, 0.3, 1.0))
-    return first, second, first_round
+    return _Explored(first, second, first_round)
 
 
 def _fit_to_all(

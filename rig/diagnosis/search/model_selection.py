@@ -85,16 +85,30 @@ class SearchResult(NamedTuple):
     gain_alike: bool
     alike: tuple[Fit, ...]
 
-    def without_laws(self, problem: Problem, why: str) -> "SearchResult":
-        """The result with the laws taken back, for a reason that held-out data give."""
-        back = tuple(
+    def rejections(self, problem: Problem, why: str) -> tuple[RejectedEffect, ...]:
+        """The chosen laws as rejected ones, for a reason that held-out data give."""
+        return tuple(
             RejectedEffect(effect(name).family, name, problem.spec.struts[at].name, why, self.left)
             for at, name in self.chosen.fit.candidate.new
         )
+
+    def with_rejected(
+        self, problem: Problem, taken_back: Sequence[RejectedEffect]
+    ) -> "SearchResult":
+        """The result with laws of larger models, taken back, first among the rejected ones."""
+        chosen = {
+            (problem.spec.struts[at].name, name) for at, name in self.chosen.fit.candidate.new
+        }
+        back = {(it.strut, it.name): it for it in taken_back if (it.strut, it.name) not in chosen}
+        rest = (it for it in self.rejected if (it.strut, it.name) not in back)
+        return self._replace(rejected=(*back.values(), *rest))
+
+    def without_laws(self, problem: Problem, why: str) -> "SearchResult":
+        """The result with the laws taken back, for a reason that held-out data give."""
         return self._replace(
             chosen=self.lawless,
             rivals=(),
-            rejected=(*back, *self.rejected),
+            rejected=(*self.rejections(problem, why), *self.rejected),
             left=None,
             evidence={},
             alike=(),
@@ -102,11 +116,15 @@ class SearchResult(NamedTuple):
 
 
 def select_model(
-    pool: Pool, first: Pool, first_round: FirstRound | None, progress: Progress
+    pool: Pool,
+    first: Pool,
+    first_round: FirstRound | None,
+    most_laws: int,
+    progress: Progress,
 ) -> SearchResult:
     """The result of a search; `first` are the models about the linear one, for rejected laws."""
     progress("removing superfluous laws", 0.85)
-    most_laws, is_repeated, rejected = pool.criteria.most_laws, False, ()
+    is_repeated, rejected = False, ()
     single = [it.laws[-1] for it in first_round.screenings] if first_round else []
     while True:
         best = pool.chosen(most_laws)
