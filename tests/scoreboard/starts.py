@@ -8,11 +8,23 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from can_dbc.errors import InputError
-from dart_model.spec import WORLD, BodySpec, InlineSkeleton, JointSpec, ModelSpec, StrutSpec
+from dart_model.spec import (
+    WORLD,
+    BodySpec,
+    InlineSkeleton,
+    JointSpec,
+    ModelSpec,
+    ModelTolerance,
+    StrutSpec,
+)
 from rig.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
+_UNKNOWN = ModelTolerance.model_validate(
+    {"stiffness_n_per_m": "100 %", "damping_n_s_per_m": "100 %"}
+)
+"""Tolerance of a spring and a damper that only stand for what was measured."""
 _SLOW = 0.4
 """Share of the resonance below which a bench answers as its spring."""
 
@@ -74,7 +86,9 @@ def dyno_start(records: Sequence[Recording], name: str) -> ModelSpec:
     stiffness, damping = max(stiffness, 1.0), max(damping, 0.0)
     # A constant force is a longer free length, within reason; the rest is left to be found.
     longer_m = float(np.clip(force_n / stiffness, -0.5 * middle_m, 0.5 * middle_m))
-    return one_body(name, (1.0, damping, stiffness), middle_m + longer_m)
+    start = one_body(name, (1.0, damping, stiffness), middle_m + longer_m)
+    # Of a force with memory these are a linear equivalent: no spring is known.
+    return start.model_copy(update={"tolerance": _UNKNOWN})
 
 
 def one_body(name: str, constants: tuple[float, float, float], free_length_m: float) -> ModelSpec:

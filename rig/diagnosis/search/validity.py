@@ -192,7 +192,8 @@ def find_improbable_linear_part(
         if times > criteria.improbable and abs(change) > abs(alone) and not is_replaced:
             return (
                 f"it requires {PARAMETERS[p.kind]} {p.nominal + float(change):.3g}, "
-                f"{times:.2g} standard deviations from the model file's {p.nominal:.3g}"
+                f"{times:.2g} standard deviations from the model file's {p.nominal:.3g} "
+                "(its tolerance states how well that is known)"
             )
     return None
 
