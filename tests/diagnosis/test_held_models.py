@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.problem.problem import free_linear, nominal, rms
 from rig.diagnosis.progress import no_progress
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import fit
-from rig.diagnosis.search.pool import FULL, Pool
+from rig.diagnosis.search.pool import FULL, Pool, _is_stuck
 from rig.diagnosis.search.score_test import ModelChange
 from rig.diagnosis.search.validity import smooth_tracks
 from tests.diagnosis import little_bench as bench
@@ -71,3 +72,17 @@ def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins():
     found = pool.fits[candidate].fit
     assert found.mean_square < 1.5
     assert found.parts.effects == pytest.approx([0.4, GAP_M], rel=1e-4)
+
+
+def test_a_fit_is_stuck_where_its_linearisation_promises_much_less_than_the_best_model():
+    problem = problem_of(WidePlay(), damping=DAMPING, duration_s=4.0)
+    law = (0, "free_play")
+    candidate = nominal(problem).with_effects(law)
+    begun = model_with(problem, {law: np.array([0.4, 1.0001 * GAP_M])}, {})
+    free = free_linear(problem, candidate)
+    ended_early, converged = (fit(problem, begun, free, effort) for effort in (Effort(0), FULL))
+    assert converged.mean_square < 1.5
+    assert ended_early.mean_square > 3.0
+    assert _is_stuck(ended_early, np.inf)
+    assert not _is_stuck(ended_early, 0.5 * converged.solution.cost)
+    assert not _is_stuck(converged, np.inf)

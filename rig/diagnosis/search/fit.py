@@ -113,6 +113,15 @@ class Fit(NamedTuple):
         return float(np.mean(self.residual**2))
 
 
+def project_out_fit(result: Fit) -> tuple[Array, Array]:
+    """Orthonormal basis (m, k) of responses to the fitted variables; residual (m,) without it."""
+    jacobian, prior = result.solution.jacobian, result.solution.prior
+    whole = np.vstack([jacobian, np.diag(np.sqrt(prior))])
+    size = np.linalg.norm(whole, axis=0)
+    basis = np.linalg.qr(whole[:, size > 0.0] / size[size > 0.0])[0][: len(jacobian)]
+    return basis, result.residual - basis @ (basis.T @ result.residual)
+
+
 def whiten_residual(problem: Problem, model: CandidateModel) -> Array | None:
     """Whitened residual of all recordings, shape (m,), or None where the model runs away."""
     residuals: list[Array] = []

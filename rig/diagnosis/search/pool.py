@@ -46,7 +46,7 @@ from rig.diagnosis.search.criteria import (
     STORING,
     SelectionCriteria,
 )
-from rig.diagnosis.search.fit import Fit, fit, validation_costs
+from rig.diagnosis.search.fit import Fit, fit, project_out_fit, validation_costs
 from rig.diagnosis.search.score_test import ModelChange, find_changes
 from rig.diagnosis.search.screen import (
     Screening,
@@ -79,6 +79,9 @@ _RIGHT, _PARTED = 100.0, 1e3
 """Mean square of a residual up to which a regression promises a nearly right model, and times that
 from which on the fit of its free run has parted from the measurement: what a model lacks is
 amplified by less."""
+_STUCK = 2.0
+"""Ratio of a converged fit's sum of squares to that of its linearisation from which on it is
+stuck: right models end at 1, beside dry friction at 1.2."""
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -224,8 +227,10 @@ class Pool:
         for candidate, _ in jobs:
             slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
 
+        least = min((model.fit.solution.cost for model in self.valid()), default=np.inf)
+
         def fit_one(begin: Callable[[], Begin]) -> ValidatedModel | None:
-            result = self._fit_from(begin(), effort)
+            result = self._fit_from(begin(), effort, least)
             return None if result is None else self.validate(result)
 
         with ThreadPoolExecutor(cpu_count()) as threads:
@@ -239,10 +244,11 @@ class Pool:
                 if model is not None:
                     self._keep(candidate, model)
 
-    def _fit_from(self, begin: Begin, effort: Effort) -> Fit | None:
-        """Fit a model in free run; where that parts, once more from a model that is let go.
+    def _fit_from(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
+        """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
 
-        None, too, where a fit began there before: its result is known.
+        `least` is the sum of squares of the best model before. None, too, where a fit began there
+        before: its result is known.
         """
         key = begin.key, effort
         if key in self.begun:
@@ -250,7 +256,8 @@ class Pool:
         self.begun.add(key)
         result = self._refit(self.problem, begin, effort)
         parted = result is None or result.mean_square > _PARTED * begin.promised
-        if begin.promised > _RIGHT or not parted or not self.held:
+        is_stuck = effort is FULL and result is not None and _is_stuck(result, least)
+        if not ((parted and begin.promised <= _RIGHT) or is_stuck) or not self.held:
             return result
         for problem in self.held:
             held = self._refit(problem, begin, effort)
@@ -527,6 +534,16 @@ class Pool:
     def is_rival(self, other: ValidatedModel, best: ValidatedModel) -> bool:
         """Whether the data cannot distinguish a model from the best one."""
         return error_ratio(other, best, self.criteria.level).low <= 1.0
+
+
+def _is_stuck(result: Fit, least: float) -> bool:
+    """Whether a converged fit is far above what its linearisation promises: less than `least`.
+
+    Where impacts amplify what they are given, the sum of squares has valleys beside valleys.
+    """
+    _, rest = project_out_fit(result)
+    promised = float(rest @ rest)
+    return promised < least and result.solution.cost > _STUCK * promised
 
 
 def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:

@@ -33,7 +33,14 @@ from rig.diagnosis.problem.problem import (
     strut_constants,
 )
 from rig.diagnosis.problem.track import law_force, linear_forces
-from rig.diagnosis.search.fit import Fit, law_space, law_values, model_for, whiten_residual
+from rig.diagnosis.search.fit import (
+    Fit,
+    law_space,
+    law_values,
+    model_for,
+    project_out_fit,
+    whiten_residual,
+)
 from rig.diagnosis.search.screen import candidate_laws, is_compatible, law_starts, scale_law
 
 Array = NDArray[np.float64]
@@ -105,7 +112,7 @@ def find_changes(
     constants = strut_constants(problem, result.parts.linear)
     tracks = tuple(track for _, track in motions)
     usual = _in_usual_steps(problem, result)
-    base = _Base(problem, result, tracks, constants, *_project_out_fit(result), usual)
+    base = _Base(problem, result, tracks, constants, *project_out_fit(result), usual)
     laws = result.candidate.new
     additions = _additions(base) if len(laws) < most_laws else []
     exchanges = list(_exchanges(base))
@@ -127,15 +134,6 @@ def find_changes(
     for change in sorted((c for c in tested if c is not None), key=lambda change: change.cost):
         best.setdefault(change.model.candidate, change)
     return tuple(best.values())
-
-
-def _project_out_fit(result: Fit) -> tuple[Array, Array]:
-    """Orthonormal basis (m, k) of responses to the fitted variables; residual (m,) without it."""
-    jacobian, prior = result.solution.jacobian, result.solution.prior
-    whole = np.vstack([jacobian, np.diag(np.sqrt(prior))])
-    size = np.linalg.norm(whole, axis=0)
-    basis = np.linalg.qr(whole[:, size > 0.0] / size[size > 0.0])[0][: len(jacobian)]
-    return basis, result.residual - basis @ (basis.T @ result.residual)
 
 
 def _in_usual_steps(problem: Problem, result: Fit) -> tuple[Problem, Array]:
