@@ -66,6 +66,10 @@ _NEAR = 0.2
 """Share of the range of a delay that is searched without any law: a standard deviation."""
 WITH_MEMORY = {"hysteresis", "unmodelled_mode"}
 """Families whose force follows the motion later, as that of a late channel does."""
+_NO_PREDICTION = 100.0
+"""Ratio of the sum of squares that a linearised fit without each block leaves there to that of the
+fit, from which on it predicts nothing: with impacts a free run parts from its neighbours, and a
+block that is left out moves the parameters by more than their linearisation holds."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -348,6 +352,21 @@ def fit(
     )
 
 
+def _expected_costs(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -> Array:
+    """Sum of squares of each block, shape (blocks,), with what a fit is expected to take off it.
+
+    Arguments as of `leave_block_out_costs`. Twice the share of each block in the number of
+    parameters, times the mean square (Mallows, Some comments on Cp, Technometrics 15, 1973).
+    """
+    count = int(blocks.max()) + 1
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
+    scaled = jacobian / size
+    inverse = np.linalg.pinv(scaled.T @ scaled + prior / np.outer(size, size), hermitian=True)
+    leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled, optimize=True)
+    squares = residual**2 + 2.0 * float(np.mean(residual**2)) * leverage
+    return np.asarray(np.bincount(blocks, squares, count), dtype=np.float64)
+
+
 def leave_block_out_costs(
     residual: Array, jacobian: Array, blocks: Integers, prior: Array
 ) -> Array:
@@ -380,9 +399,10 @@ def validation_costs(problem: Problem, result: Fit) -> Array:
     """
     starts = start_variables(problem, result)
     prior = np.diag(result.solution.prior[~starts])
-    return leave_block_out_costs(
-        result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior
-    )
+    parts = result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior
+    costs, cost = leave_block_out_costs(*parts), result.solution.cost
+    # Written so that costs without bound are no prediction either.
+    return costs if costs.sum() <= _NO_PREDICTION * cost else _expected_costs(*parts)
 
 
 def start_variables(problem: Problem, result: Fit) -> Flags:
