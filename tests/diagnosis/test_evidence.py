@@ -66,11 +66,19 @@ def test_what_happens_once_may_be_chance():
 
 def test_a_block_that_gains_most_does_not_hide_what_all_others_gain():
     law, without = draw(np.random.default_rng(4), 3.0)
-    alone = error_ratio(without, law, 1e-4)
+    before = error_ratio(without, law, 1e-4).value
     without.block_costs[7] *= 1000.0
     ratio = error_ratio(without, law, 1e-4)
     assert not gains(ratio).is_by_chance
-    assert ratio.value == pytest.approx(alone.value, rel=0.01)
+    assert ratio.value == pytest.approx(before * 1000.0 ** (0.5 / BLOCKS), rel=0.01)
+
+
+def test_a_block_that_the_law_misses_does_not_hide_what_it_gains_in_all_others():
+    law, without = draw(np.random.default_rng(6), 1e4)
+    law.block_costs[7] *= 1e6  # A free run that has parted from the measurement there.
+    ratio = error_ratio(without, law, 1e-4)
+    assert not gains(ratio).is_by_chance
+    assert ratio.value > 10.0
 
 
 @pytest.mark.slow

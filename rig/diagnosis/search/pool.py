@@ -573,24 +573,22 @@ def error_ratio(other: ValidatedModel, best: ValidatedModel, level: float) -> Ra
 
     The scatter is that of the logarithm when each block is left out (jackknife): a stop that is
     reached in few blocks makes the sums of squares scatter as much as they differ. Where one block
-    has all but all of them, nothing remains to estimate a scatter by: without that in which the
-    other model is worst, the ratio is less than it is, and the interval taken if it lies higher.
+    has all but all of them, nothing remains to estimate a scatter by: the ratio is then that in the
+    blocks, each by itself (geometric mean), if its interval lies higher.
     """
-    most = int(np.argmax(other.block_costs - best.block_costs))
-    kept = np.arange(len(best.block_costs)) != most
-    whole = _jackknife(other.block_costs, best.block_costs, level)
-    without = _jackknife(other.block_costs[kept], best.block_costs[kept], level)
-    return max(whole, without, key=lambda ratio: ratio.low)
-
-
-def _jackknife(other: Array, best: Array, level: float) -> Ratio:
-    left_out = [np.maximum(cost.sum() - cost, _TINY) for cost in (other, best)]
-    logs = 0.5 * np.log(left_out[0] / left_out[1])
-    blocks = len(logs)
-    error = float(np.sqrt((blocks - 1) * np.var(logs)))
-    half = float(student.isf(level, blocks - 1)) * error
-    value = float(np.sqrt(other.sum() / best.sum()))
-    return Ratio(value, value * math.exp(-half), value * math.exp(half))
+    costs = [np.maximum(model.block_costs, _TINY) for model in (other, best)]
+    blocks = len(costs[0])
+    left_out = [np.maximum(cost.sum() - cost, _TINY) for cost in costs]
+    jackknifed, each = (0.5 * np.log(a / b) for a, b in (left_out, costs))
+    whole = 0.5 * math.log(costs[0].sum() / costs[1].sum())
+    ratios = (
+        (whole, math.sqrt((blocks - 1) * float(np.var(jackknifed)))),
+        (float(np.mean(each)), float(np.std(each, ddof=1)) / math.sqrt(blocks)),
+    )
+    quantile = float(student.isf(level, blocks - 1))
+    middle, error = max(ratios, key=lambda ratio: ratio[0] - quantile * ratio[1])
+    half = quantile * error
+    return Ratio(*(math.exp(middle + change) for change in (0.0, -half, half)))
 
 
 def standard_error(a: ValidatedModel, b: ValidatedModel) -> float:
