@@ -371,9 +371,12 @@ class DartPlant:
         """Heights and Jacobians of the struts at coordinates `q`, shape (n,)."""
         return self._geometry.at(q)
 
-    def mechanics(self, q: Array, v: Array) -> Mechanics:
-        """Equations of motion at coordinates `q` with rates `v`, each of shape (n,)."""
-        here, inputs = self._geometry.at(q), self._skeleton.inputs
+    def mechanics(self, q: Array, v: Array, here: Jacobians | None = None) -> Mechanics:
+        """Equations of motion at coordinates `q` with rates `v`, each of shape (n,).
+
+        `here` are the Jacobians at `q` where they are known: masses make no difference to them.
+        """
+        here, inputs = here or self._geometry.at(q), self._skeleton.inputs
         free, moved = inputs.free, inputs.moved
         every, mass, bias = self._tree_at(q, v)
         columns, by_motion = here.inputs[free], np.zeros((self.struts, 0))

@@ -277,14 +277,15 @@ def tabulate_mechanism(
 
 def _mechanism_at(plants: MechanismPlants, q: Array, v: Array) -> LinearisedMechanism:
     plain = plants.plain
-    here = plain.mechanics(q, v)
+    jacobians = plain.jacobians(q)
+    here = plain.mechanics(q, v, jacobians)
     bias_q, bias_v = plain.bias_slopes(q, v)
-    heavier = [plant.mechanics(q, v) for plant in plants.heavier]
+    heavier = [plant.mechanics(q, v, jacobians) for plant in plants.heavier]
     return LinearisedMechanism(
         q[plain.free],
         v[plain.free],
         here.heights_m,
-        plain.jacobians(q).struts @ v,
+        jacobians.struts @ v,
         here.struts,
         here.inputs,
         here.moved,
