@@ -100,8 +100,9 @@ class LikelihoodGain:
         over: Effects of the other model; none are those of the best linear model.
         log_likelihood: Gain of its logarithm; the noise is what the corrected model leaves, at
             least the sensors'.
-        error_ratio: RMS residual of the other model over that of the corrected one; it is beyond
-            each end with the diagnosis's level; over a model without a law, over all laws together.
+        error_ratio: RMS residual of the other model over that of the corrected one, or the
+            geometric mean of the blocks' ratios where that is surer; it is beyond each end with the
+            diagnosis's level; over a model without a law, over all laws together.
     """
 
     over: tuple[str, ...]
