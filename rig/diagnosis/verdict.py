@@ -42,8 +42,7 @@ def confirmations(
     found: dict[StrutEffect, Confirmation] = {
         law: confirmation(it, criteria) for law, it in laws.items()
     }
-    ratios = [run.target.after / max(run.target_floor, 1e-300) for run in evaluations]
-    if quadratic_mean(ratios) <= criteria.settled:
+    if quadratic_mean(_over_floor(evaluations)) <= criteria.settled:
         return found
     settled: set[StrutEffect] = set()
     if search.evidence and _share_left(evaluations, criteria) < criteria.leading:
@@ -118,8 +117,13 @@ def _share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteri
     return min(share, _divide(force.after, force.linear))
 
 
-def _divide(after: float, linear: float) -> float:
-    return after / max(linear, 1e-300)
+def _over_floor(evaluations: Sequence[RunEvaluation]) -> list[float]:
+    """Error of the chosen model over its noise floor, of each run."""
+    return [_divide(run.target.after, run.target_floor) for run in evaluations]
+
+
+def _divide(error: float, reference: float) -> float:
+    return error / max(reference, 1e-300)
 
 
 def find_verdict(
@@ -137,7 +141,7 @@ def find_verdict(
     ambiguous where rivals explain as well, or held-out data confirm none of its laws.
     """
     chosen = search.chosen.fit
-    ratios = [run.target.after / max(run.target_floor, 1e-300) for run in evaluations]
+    ratios = _over_floor(evaluations)
     if all(ratio <= criteria.explained for ratio in ratios):
         if not (chosen.candidate.new or np.any(chosen.free)):
             at_floor = _is_at_floor(problem, chosen, criteria)

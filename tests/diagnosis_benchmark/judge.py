@@ -115,7 +115,7 @@ def _without(families: Iterable[str], left_out: Iterable[str]) -> list[str]:
 
 
 def is_right(planted: tuple[str, ...], diagnosis: dict, *, is_rough: bool = False) -> bool:
-    """Whether a diagnosis is right; what it calls a candidate counts as told.
+    """Whether a diagnosis is right; what it calls a candidate counts as named.
 
     Nothing planted: it says so; where the model file is rough, it names linear corrections at most,
     and does not say that anything is residual_of.
@@ -162,7 +162,7 @@ def false_names(
     """Families that a diagnosis names with an interval and that are not there.
 
     A linear family is none where it is a linear correction, nor the surface that names no cause,
-    nor a candidate. Where a planted family is told as a rival, what was named in its place is none.
+    nor a candidate. Where a planted family is among the rivals, what was named in its place is none.
     """
     linear = set(LINEAR_FAMILIES if is_rough else linear_families(diagnosis))
     named = [

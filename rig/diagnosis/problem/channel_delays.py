@@ -143,7 +143,7 @@ def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array
 def _read_hermite(t_s: Array, values: Array, rates: Array, delay_s: float) -> Array:
     """Values (N, ...) before a delay: Hermite's cubic by their rates, which go on beyond the ends.
 
-    Own lines instead of `scipy.interpolate.CubicHermiteSpline`, which builds each column anew: a
+    Own lines instead of `scipy.interpolate.CubicHermiteSpline`, which was set up for each column: a
     third of the time of a fit's derivatives.
     """
     known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])

@@ -411,10 +411,10 @@ class FreeRunProblem(Problem):
         if not all(np.all(np.isfinite(part)) for part in tangents):
             return None
         whitened = self._whiten_tangents(k, model, tangents)
-        wanted: list[int] = np.flatnonzero(varied).tolist()
-        order = [simulated.get(column, 0) for column in wanted]
+        parameters: list[int] = np.flatnonzero(varied).tolist()
+        order = [simulated.get(column, 0) for column in parameters]
         columns = whitened if order == list(range(directions.columns)) else whitened[:, order]
-        for i, column in enumerate(wanted):
+        for i, column in enumerate(parameters):
             if column not in simulated:
                 changed = self._difference(k, model, motion, column)
                 if changed is None:

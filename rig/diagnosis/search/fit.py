@@ -352,6 +352,12 @@ def fit(
     )
 
 
+def _scale_columns(jacobian: Array, prior: Array) -> tuple[Array, Array]:
+    """A Jacobian (m, k) in columns of unit size, and the priors' precision (k, k) likewise."""
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
+    return jacobian / size, prior / np.outer(size, size)
+
+
 def _expected_costs(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -> Array:
     """Sum of squares of each block, shape (blocks,), with what a fit is expected to take off it.
 
@@ -359,9 +365,8 @@ def _expected_costs(residual: Array, jacobian: Array, blocks: Integers, prior: A
     parameters, times the mean square (Mallows, Some comments on Cp, Technometrics 15, 1973).
     """
     count = int(blocks.max()) + 1
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
-    scaled = jacobian / size
-    inverse = np.linalg.pinv(scaled.T @ scaled + prior / np.outer(size, size), hermitian=True)
+    scaled, prior = _scale_columns(jacobian, prior)
+    inverse = np.linalg.pinv(scaled.T @ scaled + prior, hermitian=True)
     leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled, optimize=True)
     squares = residual**2 + 2.0 * float(np.mean(residual**2)) * leverage
     return np.asarray(np.bincount(blocks, squares, count), dtype=np.float64)
@@ -375,16 +380,15 @@ def leave_block_out_costs(
     Residual (m,) and Jacobian (m, k) are those at the solution, the priors' precision is (k, k).
     """
     count = int(blocks.max()) + 1
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
-    scaled = jacobian / size
-    grams = np.zeros((count, len(size), len(size)))
-    gradients = np.zeros((count, len(size)))
+    scaled, prior = _scale_columns(jacobian, prior)
+    grams = np.zeros((count, *prior.shape))
+    gradients = np.zeros((count, len(prior)))
     squares = np.bincount(blocks, residual**2, count)
     for b in range(count):
         part = blocks == b
         grams[b] = scaled[part].T @ scaled[part]
         gradients[b] = scaled[part].T @ residual[part]
-    whole = grams.sum(axis=0) + prior / np.outer(size, size)
+    whole = grams.sum(axis=0) + prior
     costs = np.empty(count)
     for b in range(count):
         step = np.linalg.lstsq(whole - grams[b], gradients[b], rcond=1e-9)[0]
