@@ -162,7 +162,7 @@ def false_names(
     """Families that a diagnosis names with an interval and that are not there.
 
     A linear family is none where it is a linear correction, nor the surface that names no cause,
-    nor a candidate. Where a planted family is among the rivals, what was named in its place is none.
+    nor a candidate. Where a planted family is a rival, what was named in its place is none.
     """
     linear = set(LINEAR_FAMILIES if is_rough else linear_families(diagnosis))
     named = [
