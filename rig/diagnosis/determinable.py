@@ -35,7 +35,7 @@ from rig.diagnosis.recording_bounds import (
     RecordingFacts,
 )
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.screen import Stage, candidate_laws, law_starts, response, stage_of
+from rig.diagnosis.search.screen import Stage, candidate_laws, law_starts, responses, stage_of
 from rig.recordings.recording import Recording
 from rig.recordings.stretches import find_stretches
 
@@ -218,10 +218,10 @@ def _visible_laws(stage: Stage) -> dict[int, list[_Visible]]:
     problem, taken = stage.problem, _thinning(stage)
     for at in candidate_laws(problem):
         compile_law(at[1])
-        for start in law_starts(problem, at, {}):
+        starts = law_starts(problem, at, {})
+        for start, column in zip(starts, responses(stage, at, starts).T, strict=True):
             forces = segment_forces(stage.segments, at, start, stage.constants, reference=False)
             force_n = rms(np.concatenate(forces))
-            column = response(stage, at, start)
             length = float(np.linalg.norm(column))
             if not (np.isfinite(length) and force_n > 0.0 and length > 0.0):
                 continue

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from rig.diagnosis.numerics.least_squares import Differences, Effort, Exact, Space, solve
+from rig.diagnosis.numerics.least_squares import (
+    Differences,
+    Effort,
+    Exact,
+    Space,
+    Together,
+    solve,
+)
 
 FREE = Space(
     low=np.full(2, -1e6), high=np.full(2, 1e6), scale=np.ones(2), logarithmic=np.zeros(2, np.bool_)
@@ -68,3 +75,31 @@ def test_an_exact_derivative_is_taken_as_it_is():
     slope = np.array([[2.0, 0.0], [0.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
     function = Exact(lambda _: slope, Differences(lambda x: MATRIX @ x - MEASURED))
     np.testing.assert_array_equal(function.jacobian(np.zeros(2), -MEASURED, FREE, 1), slope)
+
+
+def test_residuals_that_are_had_together_lead_where_single_ones_do():
+    """A parameter at its upper bound has a difference on its other side; a fixed one has none."""
+
+    def residual_of(x):
+        return np.array([x[0] ** 2 - 2.0, 3.0 * x[1] - x[0], x[2] - 1.0])
+
+    low, high = np.array([0.1, -5.0, 2.0]), np.array([1.0, 5.0, 2.0])
+    space = Space(low, high, np.ones(3), np.array([True, False, False]))
+    start = np.array([1.0, 4.0, 2.0])
+    several = Together(lambda points: np.array([residual_of(x) for x in points]).T)
+    each, together = (
+        solve(function, start, space, Effort(steps=20, sides=1))
+        for function in (Differences(residual_of), several)
+    )
+    assert each is not None
+    assert together is not None
+    np.testing.assert_allclose(together.values, [1.0, 1.0 / 3.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(together.jacobian, each.jacobian, atol=1e-9)
+    assert np.all(together.jacobian[:, 2] == 0.0)
+
+
+def test_what_is_not_finite_has_no_derivative_together():
+    several = Together(lambda points: np.where(points[:, :1].T > 1.0, np.inf, points.T))
+    found = several.jacobian(np.array([1.0, 0.5]), np.array([1.0, 0.5]), FREE, 1)
+    np.testing.assert_allclose(found, [[0.0, 0.0], [0.0, 1.0]], atol=1e-9)
+    assert several.residual_of(np.array([2.0, 0.0])) is None

@@ -134,7 +134,7 @@ def test_the_regression_about_a_model_responds_to_forces_linearly(problems, fits
         rows = len(segment.target)
         assert segment.linear.shape == (rows, len(problem.linear))
         assert len(segment.initial) == len(segment.blocks) == rows
-        force = np.sin(segment.track.t_s)
+        force = np.sin(segment.track.t_s)[:, np.newaxis]
         twice = segment.respond(0, 2.0 * force)
         assert twice == pytest.approx(2.0 * segment.respond(0, force), rel=1e-9, abs=1e-12)
 

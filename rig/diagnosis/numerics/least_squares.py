@@ -185,6 +185,36 @@ class Differences(NamedTuple):
         return columns
 
 
+class Together(NamedTuple):
+    """A residual that is had at many points for little more than at one.
+
+    Attributes:
+        residuals_of: Residuals (m, t) at parameters (t, k).
+    """
+
+    residuals_of: Callable[[Array], Array]
+
+    def residual_of(self, values: Array) -> Array | None:
+        """Residual (m,) at parameters (k,), or None where it is not finite."""
+        residual = self.residuals_of(values[np.newaxis])[:, 0]
+        return residual if np.all(np.isfinite(residual)) else None
+
+    def jacobian(self, x: Array, residual: Array, space: Space, sides: int) -> Array:
+        """Derivatives (m, k) at search variables, by differences of the side that has room."""
+        del sides
+        sizes = _DIFFERENCE * np.where(space.logarithmic, 1.0, np.maximum(1.0, np.abs(x)))
+        values = space.outer(x + np.diag(sizes))
+        moves = np.diag(space.inner(values)) - x
+        narrow = np.abs(moves) < 0.5 * sizes
+        values[narrow] = space.outer(x - np.diag(sizes))[narrow]
+        moves = np.diag(space.inner(values)) - x
+        columns = np.zeros((len(residual), len(x)))
+        free = np.abs(moves) >= 0.5 * sizes
+        columns[:, free] = (self.residuals_of(values[free]) - residual[:, np.newaxis]) / moves[free]
+        columns[:, ~np.all(np.isfinite(columns), axis=0)] = 0.0
+        return columns
+
+
 class Exact(NamedTuple):
     """A residual with its exact derivatives by parameters.
 
@@ -221,7 +251,7 @@ class Exact(NamedTuple):
 
 
 def solve(
-    function: Exact | Differences,
+    function: Exact | Differences | Together,
     start: Array,
     space: Space,
     effort: Effort,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.sparse import csr_array
 
 from dart_model.spec import ModelSpec
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE
@@ -177,30 +178,30 @@ def known_share(t_s: Array, delays_s: Array) -> Array:
     return np.clip(1.0 + np.minimum(there - t_s[0], t_s[-1] - there) / step, 0.0, 1.0)
 
 
-class LateReader:
-    """Reads columns on a grid as delayed sensors show them at some times.
+def late_reader(grid_s: Array, at_s: Array, delays_s: Array) -> csr_array:
+    """Matrix that reads columns on a grid as delayed sensors show them at some times.
 
     Args:
         grid_s: Times of the grid, shape (N,).
         at_s: Times that are read, among them, shape (m,).
         delays_s: Delay of each column, shape (k,).
+
+    Returns:
+        Weights, shape (m k, N k), of columns (N, k) in what is read, (m, k), both by rows.
     """
-
-    def __init__(self, grid_s: Array, at_s: Array, delays_s: Array) -> None:
-        self._rows = np.searchsorted(grid_s, at_s - 1e-12)
-        self._late: dict[int, tuple[NDArray[np.int64], Array]] = {}
-        for column in np.flatnonzero(delays_s).tolist():
-            late_s = np.clip(at_s - delays_s[column], grid_s[0], grid_s[-1])
-            first = np.clip(np.searchsorted(grid_s, late_s) - 2, 0, len(grid_s) - _POINTS)
-            around = first[:, np.newaxis] + np.arange(_POINTS)
-            self._late[column] = around, _lagrange_weights(grid_s[around], late_s)
-
-    def __call__(self, columns: Array) -> Array:
-        """The columns (N, k) at the times that are read, shape (m, k)."""
-        read = columns[self._rows]
-        for column, (around, weights) in self._late.items():
-            read[:, column] = np.sum(columns[around, column] * weights, axis=1)
-        return read
+    late_s = np.clip(at_s[:, np.newaxis] - delays_s, grid_s[0], grid_s[-1])
+    first = np.clip(np.searchsorted(grid_s, late_s) - 2, 0, len(grid_s) - _POINTS)
+    around = first[..., np.newaxis] + np.arange(_POINTS)
+    weights = _lagrange_weights(grid_s[around], late_s)
+    exact = np.searchsorted(grid_s, at_s - 1e-12)[:, np.newaxis, np.newaxis]
+    weights = np.where(delays_s[:, np.newaxis] == 0.0, around == exact, weights)
+    count = len(delays_s)
+    columns = around * count + np.arange(count)[:, np.newaxis]
+    ends = np.arange(0, weights.size + 1, _POINTS)
+    shape = len(at_s) * count, len(grid_s) * count
+    reader = csr_array((weights.ravel(), columns.ravel(), ends), shape=shape)
+    reader.eliminate_zeros()
+    return reader
 
 
 _POINTS = 4
@@ -208,10 +209,10 @@ _POINTS = 4
 
 
 def _lagrange_weights(nodes: Array, at: Array) -> Array:
-    """Weights (m, k) of the values at nodes (m, k) in their polynomial's value at times (m,)."""
+    """Weights (..., k) of values at nodes (..., k) in their polynomial's value at times (...)."""
     weights = np.ones_like(nodes)
-    for i in range(nodes.shape[1]):
-        for j in range(nodes.shape[1]):
+    for i in range(nodes.shape[-1]):
+        for j in range(nodes.shape[-1]):
             if i != j:
-                weights[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
+                weights[..., i] *= (at - nodes[..., j]) / (nodes[..., i] - nodes[..., j])
     return weights

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.sparse import diags_array
 
 from dart_model.effects import Bench
 from dart_model.spec import WORLD, ModelSpec
@@ -36,12 +37,12 @@ from rig.diagnosis.problem import linear_part, on_dart, track
 from rig.diagnosis.problem.channel_delays import (
     SIGNIFICANT,
     Delays,
-    LateReader,
     delays_of,
     gains_of,
     height_gains,
     known_share,
     late_columns,
+    late_reader,
 )
 from rig.diagnosis.problem.directions import by_linear_part, directions_of, pushed_by
 from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
@@ -744,21 +745,23 @@ class FreeRunProblem(Problem):
         temperature_c = np.interp(t_s, grid.t_s, grid.temperature_c)
         along = Track.of_columns(t_s, z, w, applied, temperature_c)
         rows = np.flatnonzero(grid.fitted[cut])
-        read = LateReader(t_s, grid.t_s[cut][rows], delays_s)
         weight = known_share(grid.t_s, delays_s)[cut][rows] / self.noise_m
+        read = late_reader(t_s, grid.t_s[cut][rows], delays_s)
+        read = (diags_array((gains * weight).ravel()) @ read).tocsr()
 
         def whiten(heights_m: Array) -> Array:
             """Changes (N, struts) of heights as they are seen, whitened, shape (m,)."""
-            return (read(heights_m) * gains * weight).ravel()
+            return np.asarray(read @ heights_m.ravel())
 
-        def whiten_heights(forces: Array) -> Array:
+        def whiten_heights(generalised: Array) -> Array:
             """Whitened heights (m,) under generalised forces (N, n)."""
-            return whiten(dynamics.heights(forces))
+            return whiten(dynamics.heights(generalised, np.ones((len(t_s), 1))))
 
         mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s, inputs)
 
-        def respond_to(strut: int, force: Array) -> Array:
-            return whiten_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
+        def respond_to(strut: int, forces: Array) -> Array:
+            heights_m = dynamics.heights(mechanism.jacobian[:, strut], forces)
+            return np.asarray(read @ heights_m.reshape(-1, forces.shape[1]))
 
         raw = grid.heights_m[cut] - seen[0][cut]
         held = dynamics.holding_forces(states[0], states[1], grid.t_s[cut], t_s)

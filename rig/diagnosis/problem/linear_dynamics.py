@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import Motion
-from rig.diagnosis.numerics.laws import MATRIX, compile_loop
+from rig.diagnosis.numerics.laws import CUBE, MATRIX, compile_loop
 from rig.diagnosis.problem import linear_part
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.mechanism import LinearisedMechanism, solve_nearest
@@ -23,47 +23,104 @@ _SETTLES_WITHIN = 0.15
 """Time constant of the slowest response of the regression's dynamics, as a share of a segment."""
 
 
-def _respond(
-    transition: Array, early: Array, late: Array, output: Array, forces: Array, heights: Array
+def _respond_as_one(
+    transition: Array,
+    early: Array,
+    late: Array,
+    output: Array,
+    directions: Array,
+    forces: Array,
+    heights: Array,
 ) -> None:
-    size = transition.shape[0]
-    if size == 2 and output.shape[0] == 1 and forces.shape[1] == 1:
-        a00, a01, a10, a11 = transition[0, 0], transition[0, 1], transition[1, 0], transition[1, 1]
-        b0, b1, c0, c1 = early[0, 0], early[1, 0], late[0, 0], late[1, 0]
-        g0, g1 = output[0, 0], output[0, 1]
+    samples = forces.shape[0]
+    a00, a01, a10, a11 = transition[0, 0], transition[0, 1], transition[1, 0], transition[1, 1]
+    b0, b1, c0, c1 = early[0, 0], early[1, 0], late[0, 0], late[1, 0]
+    unit = output[0, 0]
+    for c in range(forces.shape[1]):
         u = 0.0
         v = 0.0
-        for k in range(forces.shape[0]):
-            heights[k, 0] = g0 * u + g1 * v
-            if k + 1 < forces.shape[0]:
-                f = forces[k, 0]
-                g = forces[k + 1, 0]
+        for k in range(samples):
+            heights[k, 0, c] = unit * u
+            if k + 1 < samples:
+                f = directions[k, 0] * forces[k, c]
+                g = directions[k + 1, 0] * forces[k + 1, c]
                 u, v = a00 * u + a01 * v + b0 * f + c0 * g, a10 * u + a11 * v + b1 * f + c1 * g
-        return
+
+
+def _respond_alone(
+    transition: Array,
+    early: Array,
+    late: Array,
+    output: Array,
+    directions: Array,
+    forces: Array,
+    heights: Array,
+) -> None:
+    size = transition.shape[0]
     x = np.zeros(size)
     y = np.zeros(size)
     for k in range(forces.shape[0]):
         for i in range(output.shape[0]):
             total = 0.0
-            for j in range(size):
+            for j in range(output.shape[1]):
                 total += output[i, j] * x[j]
-            heights[k, i] = total
+            heights[k, i, 0] = total
         if k + 1 == forces.shape[0]:
             break
         for i in range(size):
             total = 0.0
             for j in range(size):
                 total += transition[i, j] * x[j]
-            for j in range(forces.shape[1]):
-                total += early[i, j] * forces[k, j] + late[i, j] * forces[k + 1, j]
-            y[i] = total
+            before = 0.0
+            after = 0.0
+            for j in range(directions.shape[1]):
+                before += early[i, j] * directions[k, j]
+                after += late[i, j] * directions[k + 1, j]
+            y[i] = total + before * forces[k, 0] + after * forces[k + 1, 0]
+        x, y = y, x
+
+
+def _respond_together(
+    transition: Array,
+    early: Array,
+    late: Array,
+    output: Array,
+    directions: Array,
+    forces: Array,
+    heights: Array,
+) -> None:
+    size, samples, columns = transition.shape[0], forces.shape[0], forces.shape[1]
+    # Columns last and innermost: they go through the processor side by side.
+    x = np.zeros((size, columns))
+    y = np.zeros((size, columns))
+    heights[:] = 0.0
+    for k in range(samples):
+        for i in range(output.shape[0]):
+            for j in range(output.shape[1]):
+                share = output[i, j]
+                for c in range(columns):
+                    heights[k, i, c] += share * x[j, c]
+        if k + 1 == samples:
+            break
         for i in range(size):
-            x[i] = y[i]
+            before = 0.0
+            after = 0.0
+            for j in range(directions.shape[1]):
+                before += early[i, j] * directions[k, j]
+                after += late[i, j] * directions[k + 1, j]
+            for c in range(columns):
+                y[i, c] = before * forces[k, c] + after * forces[k + 1, c]
+            for j in range(size):
+                share = transition[i, j]
+                for c in range(columns):
+                    y[i, c] += share * x[j, c]
+        x, y = y, x
 
 
-respond = compile_loop(_respond, types.void(*(MATRIX,) * 6))
-"""Heights (N, struts), written, of the linear model from rest under forces (N, n): transition,
-input matrices for the force before and after each step, and output matrix of its discretisation."""
+_RESPOND = types.void(*(MATRIX,) * 6, CUBE)
+_respond_as_one = compile_loop(_respond_as_one, _RESPOND)
+_respond_alone = compile_loop(_respond_alone, _RESPOND)
+_respond_together = compile_loop(_respond_together, _RESPOND)
 
 
 class FilterMechanism:
@@ -139,16 +196,20 @@ class LinearDynamics:
             e[: 2 * n, : 2 * n],
             e[: 2 * n, 2 * n : 3 * n] - late,
             late,
-            np.hstack([jacobian, np.zeros_like(jacobian)]),
+            jacobian,
         )
-        self._parts = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in parts)
+        transition, early, late, output = (
+            np.ascontiguousarray(part, dtype=np.float64) for part in parts
+        )
+        self._parts = transition, early, late, output
         self._jacobian = jacobian
 
-    def heights(self, forces: Array) -> Array:
-        """Heights (N, struts) from rest under generalised forces (N, n)."""
-        out = np.empty((len(forces), len(self._jacobian)))
-        transition, early, late, output = self._parts
-        respond(transition, early, late, output, np.ascontiguousarray(forces), out)
+    def heights(self, directions: Array, forces: Array) -> Array:
+        """Heights (N, struts, k) from rest under forces (N, k) along generalised ones (N, n)."""
+        out = np.empty((len(forces), len(self._jacobian), forces.shape[1]))
+        several = _respond_alone if forces.shape[1] == 1 else _respond_together
+        loop = _respond_as_one if self._jacobian.size == 1 else several
+        loop(*self._parts, np.ascontiguousarray(directions), np.ascontiguousarray(forces), out)
         return out
 
     def holding_forces(self, z: Array, w: Array, nodes_s: Array, t_s: Array) -> Array:
@@ -165,7 +226,8 @@ class LinearDynamics:
         while len(powers) < samples:
             powers = np.concatenate([powers, powers @ ahead])
             ahead = ahead @ ahead
-        return [(output @ powers[:samples, :, i].T).T for i in range(len(transition))]
+        n = output.shape[1]
+        return [(output @ powers[:samples, :n, i].T).T for i in range(len(transition))]
 
 
 def system_matrix(mass: Array, stiffness: Array, damping: Array) -> Array:

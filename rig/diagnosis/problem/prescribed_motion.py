@@ -338,10 +338,12 @@ class PrescribedProblem(Problem):
 
         shares = known_share(whole.t_s, delays_s)[cut].T
 
-        def respond(strut: int, force: Array) -> Array:
-            forces = np.zeros((len(self.noise_n), len(force)))
-            forces[strut] = force
-            return self._whiten(shares * forces, rows)
+        def respond(strut: int, forces: Array) -> Array:
+            seen = np.zeros((len(rows), len(self._cell_struts), forces.shape[1]))
+            own = np.flatnonzero(np.equal(self._cell_struts, strut))
+            weight = shares[strut, rows] / self.noise_n[strut]
+            seen[:, own] = (weight[:, np.newaxis] * forces[rows])[:, np.newaxis]
+            return seen.reshape(-1, forces.shape[1])
 
         columns: list[Array] = []
         for p in self.linear:
@@ -350,7 +352,7 @@ class PrescribedProblem(Problem):
             if p.kind == "delay":
                 # By the measured rate, in which is what the model lacks.
                 force = -run.cell_rates_n_per_s[p.strut, cut]
-            columns.append(respond(p.strut, force))
+            columns.append(respond(p.strut, force[:, np.newaxis])[:, 0])
         target = self._whiten(residual_n[:, cut], rows)
         return Segment(
             along,

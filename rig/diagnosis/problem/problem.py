@@ -136,7 +136,7 @@ class Segment(NamedTuple):
         reference: The motion along which the reference's laws acted.
         lead: Both motions over the whole recording, of which this is a part, for laws whose
             internal state depends on what went before; None where this is all of it.
-        respond: Change of the whitened response, shape (m,), by a force (N,) in a strut.
+        respond: Changes of the whitened response, shape (m, k), by forces (N, k) in a strut.
         target: Whitened residual of the reference, shape (m,).
         linear: Whitened responses to a unit change of each linear parameter, shape (m, L).
         initial: Whitened responses to initial states, shape (m, c).

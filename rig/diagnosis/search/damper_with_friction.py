@@ -53,10 +53,16 @@ def _best_values(
     speed = stage.problem.motions[at[1][0]].speed_m_per_s
     knees = [share * speed for share in _KNEES]
 
-    friction = this.column(at[0], dry)
-    added = this.column(at[1], _valves((0.0, 1.0, 0.0), speed, speed))
-    compression = [this.column(at[1], _valves((1.0, 0.0, 0.0), knee, knee)) for knee in knees]
-    rebound = [this.column(at[1], _valves((0.0, 0.0, 1.0), knee, knee)) for knee in knees]
+    (friction,) = this.columns(at[0], [dry]).T
+    added, *zones = this.columns(
+        at[1],
+        [
+            _valves((0.0, 1.0, 0.0), speed, speed),
+            *(_valves((1.0, 0.0, 0.0), knee, knee) for knee in knees),
+            *(_valves((0.0, 0.0, 1.0), knee, knee) for knee in knees),
+        ],
+    ).T
+    compression, rebound = zones[: len(knees)], zones[len(knees) :]
     best, least = None, np.inf
     for i, j in itertools.product(range(len(knees)), repeat=2):
         columns = np.column_stack([friction, compression[i], added, rebound[j]])

@@ -7,7 +7,6 @@ force is proportional to its size costs one pass a start; the best are then refi
 all other laws of their combination.
 """
 
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -22,10 +21,10 @@ from dart_model.effects import CATALOGUE, effect
 from dart_model.effects.calling import arguments
 from rig.diagnosis.numerics.laws import compile_law
 from rig.diagnosis.numerics.least_squares import (
-    Differences,
     Effort,
     Prior,
     Space,
+    Together,
     concatenate_spaces,
     solve,
 )
@@ -62,8 +61,8 @@ _FINE = 5
 """Laws of a round that are refined on all samples: one more than `fitted_a_size`."""
 _REFINEMENT = Effort(7, 1e-3, 1)
 """Fits of laws along the motion."""
-_REMEMBERED = 3
-"""Responses of a law that are kept for the next difference."""
+_TOGETHER = 16
+"""Starts of a law that are evaluated together: as many columns stay in the processor's cache."""
 _RANK = 1e-10
 """Singular values below this share of the largest are rounding."""
 _DIFFERENCE = 1e-4
@@ -163,7 +162,7 @@ def _stage(
                 new = _tangents(segments, at, values, constants, measured)
                 tangents = [old + more for old, more in zip(tangents, new, strict=True)]
         for k, (segment, force) in enumerate(zip(segments, forces, strict=True)):
-            target[k] += segment.respond(at[0], force)
+            target[k] += segment.respond(at[0], force[:, np.newaxis])[:, 0]
     stage = _project_out_nuisance(problem, reference, segments, target, tangents)
     return stage._replace(coarse=coarse)
 
@@ -182,7 +181,8 @@ def _tangents(
         moved[i] += _DIFFERENCE * (abs(value) or 1.0)
         changed = segment_forces(segments, at, moved, constants, reference=False)
         for k, segment in enumerate(segments):
-            tangents[k].append(segment.respond(at[0], changed[k] - forces[k]))
+            change = (changed[k] - forces[k])[:, np.newaxis]
+            tangents[k].append(segment.respond(at[0], change)[:, 0])
     return tangents
 
 
@@ -227,17 +227,23 @@ def _project_out_nuisance(
     )
 
 
-def _whole_response(stage: Stage, at: StrutEffect, values: Array) -> Array:
-    """Change of the whitened response by a law, shape (m,)."""
-    constants, (parameters, shift) = stage.constants, law_and_shift(at[1], values)
-    if shift:
-        constants = constants.copy()
-        constants[at[0], 0] += shift
-    forces = segment_forces(stage.segments, at, parameters, constants, reference=False)
+def _whole_responses(stage: Stage, at: StrutEffect, each: Sequence[Array]) -> Array:
+    """Changes of the whitened response by a law with parameters each, shape (m, k)."""
+    forces = [np.empty((len(segment.track.t_s), len(each))) for segment in stage.segments]
+    for i, values in enumerate(each):
+        constants, (parameters, shift) = stage.constants, law_and_shift(at[1], values)
+        if shift:
+            constants = constants.copy()
+            constants[at[0], 0] += shift
+        own = segment_forces(stage.segments, at, parameters, constants, reference=False)
+        for columns, force in zip(forces, own, strict=True):
+            columns[:, i] = force
     parts = [
-        segment.respond(at[0], force) for segment, force in zip(stage.segments, forces, strict=True)
+        segment.respond(at[0], columns)
+        for segment, columns in zip(stage.segments, forces, strict=True)
     ]
-    return np.concatenate([*parts, np.zeros(len(stage.target) - sum(map(len, parts)))])
+    priors = len(stage.target) - sum(map(len, parts))
+    return np.concatenate([*parts, np.zeros((priors, len(each)))])
 
 
 def law_and_shift(name: str, values: Array) -> tuple[Array, float]:
@@ -267,9 +273,12 @@ def _space(stage: Stage, at: StrutEffect, values: Array) -> tuple[Space, Array]:
     return concatenate_spaces([space, shift]), np.append(np.zeros(len(parameters)), 1.0)
 
 
-def response(stage: Stage, at: StrutEffect, values: Array) -> Array:
-    """Change of the whitened response by a law, the linear part projected out, shape (m,)."""
-    whole = _whole_response(stage, at, values)
+def responses(stage: Stage, at: StrutEffect, each: Sequence[Array]) -> Array:
+    """Changes of the whitened response by a law with parameters each, shape (m, k).
+
+    The linear part is projected out.
+    """
+    whole = _whole_responses(stage, at, each)
     return whole - stage.basis @ (stage.basis.T @ whole)
 
 
@@ -277,7 +286,7 @@ def linear_changes(stage: Stage, screening: Screening) -> Array:
     """Changes of the linear parameters against the reference together with laws, shape (L,)."""
     residual = stage.goal.copy()
     for at, values in zip(screening.laws, screening.values, strict=True):
-        residual -= _whole_response(stage, at, values)
+        residual -= _whole_responses(stage, at, [values])[:, 0]
     size = np.maximum(np.linalg.norm(stage.nuisance, axis=0), 1e-300)
     solution = np.linalg.lstsq(stage.nuisance / size, residual, rcond=_RANK)[0] / size
     changes = np.zeros(len(stage.problem.linear))
@@ -328,17 +337,20 @@ class Round(NamedTuple):
     residual: Array
     basis: Array
 
-    def column(self, at: StrutEffect, values: Array) -> Array:
-        """Response of a law on the coarse regression, tangents projected out, shape (m,)."""
-        column = response(self.coarse, at, values)
-        return column - self.basis @ (self.basis.T @ column)
+    def columns(self, at: StrutEffect, each: Sequence[Array]) -> Array:
+        """Responses of a law on the coarse regression, tangents projected out, shape (m, k)."""
+        columns = responses(self.coarse, at, each)
+        return columns - self.basis @ (self.basis.T @ columns)
 
     def starts(self, at: StrutEffect, known: Mapping[str, float]) -> list[_Start]:
         """Starts of a law, best first."""
+        every = law_starts(self.stage.problem, at, known)
         starts = [
-            _evaluate_start(self, at, start) for start in law_starts(self.stage.problem, at, known)
+            start
+            for first in range(0, len(every), _TOGETHER)
+            for start in _evaluate_starts(self, at, every[first : first + _TOGETHER])
         ]
-        return sorted((s for s in starts if s is not None), key=lambda start: start[0])
+        return sorted(starts, key=lambda start: start[0])
 
     def refine_coarsely(self, job: tuple[StrutEffect, Array]) -> Screening | None:
         """The combination with a law from a start, refined on the coarse regression."""
@@ -469,20 +481,20 @@ def _reads_velocity_alone(name: str) -> bool:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.
-def _evaluate_start(this: Round, at: StrutEffect, start: Array) -> _Start | None:
-    """Cost and parameters of a law at a start, its size by least squares where it has one."""
-    column = this.column(at, start)
-    power = float(column @ column)
-    if not np.isfinite(power) or power <= 0.0:
-        return None
-    if effect(at[1]).scaled:
-        match = float(column @ this.residual)
-        values = scale_law(at[1], start, match / power)
-        if values is None:
-            return None
-        return float(this.residual @ this.residual) - match * (match / power), values
-    residual = this.residual - column
-    return float(residual @ residual), start
+def _evaluate_starts(this: Round, at: StrutEffect, starts: Sequence[Array]) -> list[_Start]:
+    """Costs and parameters of a law at its starts, its size by least squares where it has one."""
+    columns = this.columns(at, starts)
+    powers, matches = np.sum(columns**2, axis=0), this.residual @ columns
+    nothing = float(this.residual @ this.residual)
+    evaluated: list[_Start] = []
+    for start, power, match in zip(starts, powers.tolist(), matches.tolist(), strict=True):
+        if not np.isfinite(power) or power <= 0.0:
+            continue
+        size = match / power if effect(at[1]).scaled else 1.0
+        values = scale_law(at[1], start, size)
+        if values is not None:
+            evaluated.append((nothing - size * (2.0 * match - size * power), values))
+    return evaluated
 
 
 def scale_law(name: str, values: Array, size: float) -> Array | None:
@@ -498,7 +510,7 @@ def scale_law(name: str, values: Array, size: float) -> Array | None:
 def _residual(stage: Stage, laws: Sequence[StrutEffect], values: Sequence[Array]) -> Array:
     total = stage.target
     for at, parameters in zip(laws, values, strict=True):
-        total = total - response(stage, at, parameters)
+        total = total - responses(stage, at, [parameters])[:, 0]
     return total
 
 
@@ -507,47 +519,36 @@ def _law_tangents(stage: Stage, base: Screening) -> Array:
     """Derivatives of the response by the parameters of a combination's laws, shape (m, k)."""
     columns: list[Array] = []
     for at, values in zip(base.laws, base.values, strict=True):
-        unmoved = response(stage, at, values)
         space, _ = _space(stage, at, values)
         inner = space.inner(values)
-        for i in range(len(values)):
-            moved = inner.copy()
-            moved[i] += _DIFFERENCE * max(1.0, abs(inner[i]))
-            columns.append(response(stage, at, space.outer(moved)) - unmoved)
+        moved = inner + np.diag(_DIFFERENCE * np.maximum(1.0, np.abs(inner)))
+        unmoved, *changed = responses(stage, at, [values, *map(space.outer, moved)]).T
+        columns += [column - unmoved for column in changed]
     used = [column / size for column in columns if (size := float(np.linalg.norm(column))) > 0.0]
     return np.column_stack(used) if used else np.zeros((len(stage.target), 0))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # No step is taken from what overflows.
 def refine(stage: Stage, laws: Sequence[StrutEffect], values: Sequence[Array]) -> Screening | None:
     """All parameters of a combination of laws, fitted together along the motion."""
     values = [_with_shift(name, own) for (_, name), own in zip(laws, values, strict=True)]
-    lengths = np.cumsum([0, *(len(own) for own in values)])
-    known: list[dict[bytes, Array]] = [{} for _ in laws]
+    ends = np.cumsum([len(own) for own in values])[:-1]
 
-    def split(x: Array) -> list[Array]:
-        return [x[a:b] for a, b in itertools.pairwise(lengths)]
-
-    def law_response(i: int, parameters: Array) -> Array:
-        # A difference changes one parameter: the other laws respond as before.
-        key = parameters.tobytes()
-        if key not in known[i]:
-            if len(known[i]) > _REMEMBERED:
-                known[i].clear()
-            known[i][key] = response(stage, laws[i], parameters)
-        return known[i][key]
-
-    def residual_of(x: Array) -> Array | None:
-        responses = [law_response(i, parameters) for i, parameters in enumerate(split(x))]
-        residual = stage.target - np.sum(responses, axis=0)
-        return residual if np.all(np.isfinite(residual)) else None
+    def residuals_of(points: Array) -> Array:
+        residuals = np.repeat(stage.target[:, np.newaxis], len(points), axis=1)
+        for at, own in zip(laws, np.split(points, ends, axis=1), strict=True):
+            # A difference changes one parameter: the other laws respond as before.
+            each, which = np.unique(own, axis=0, return_inverse=True)
+            residuals -= responses(stage, at, list(each))[:, which]
+        return residuals
 
     spaces = [_space(stage, at, own) for at, own in zip(laws, values, strict=True)]
     weights = np.concatenate([weight for _, weight in spaces])
     prior = Prior(np.zeros(len(weights)), weights, 1.0)
     space = concatenate_spaces([space for space, _ in spaces])
-    differences = Differences(residual_of)
-    solution = solve(differences, np.concatenate(values), space, _REFINEMENT, prior)
+    solution = solve(Together(residuals_of), np.concatenate(values), space, _REFINEMENT, prior)
     if solution is None:
         return None
     block_costs = _block_costs(stage, solution.residual, solution.jacobian)
-    return Screening(tuple(laws), tuple(split(solution.values)), solution.cost, block_costs)
+    refined = tuple(np.split(solution.values, ends))
+    return Screening(tuple(laws), refined, solution.cost, block_costs)

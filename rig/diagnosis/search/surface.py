@@ -8,11 +8,11 @@ with B-splines and penalties, Stat. Sci. 11 (1996), for the penalty on second di
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects.restoring_surface import FIRST_FORCE, HEIGHTS, VELOCITIES
+from dart_model.effects.restoring_surface import HEIGHTS, VELOCITIES
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.problem import CandidateModel, Parts, Problem, existing_values, nominal
 from rig.diagnosis.search.fit import Fit, fit, leave_block_out_costs
-from rig.diagnosis.search.screen import Stage, response, stage_of
+from rig.diagnosis.search.screen import Stage, responses, stage_of
 
 Array = NDArray[np.float64]
 
@@ -42,11 +42,8 @@ def _table(stage: Stage, strut: int) -> tuple[Array, float]:
     top = motion.top_speed_m_per_s
     limits = np.array([motion.low_m, motion.high_m, -top, top])
     cells = HEIGHTS * VELOCITIES
-    columns = np.empty((len(stage.target), cells))
-    for i in range(cells):
-        unit = np.zeros(FIRST_FORCE + cells)
-        unit[:FIRST_FORCE], unit[FIRST_FORCE + i] = limits, 1.0
-        columns[:, i] = response(stage, (strut, _NAME), unit)
+    units = [np.concatenate([limits, unit]) for unit in np.eye(cells)]
+    columns = responses(stage, (strut, _NAME), units)
     bends = _bends()
     gram, gradient = columns.T @ columns, columns.T @ stage.target
     unit = float(np.trace(gram)) / float(np.trace(bends))
