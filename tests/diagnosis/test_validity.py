@@ -55,6 +55,11 @@ def test_a_correction_that_no_law_makes_larger_says_nothing_against_the_law():
     assert reason((2.1, 0.0, 0.0), "coulomb_friction", lawless=(2.2, 0.0, 0.0)) is None
 
 
+def test_the_best_linear_model_is_bent_by_what_it_lacks():
+    assert reason((2.6, 0.0, 0.0), "coulomb_friction", lawless=(1.9, 0.0, 0.0)) is None
+    assert reason((3.1, 0.0, 0.0), "coulomb_friction", lawless=(1.9, 0.0, 0.0)) is not None
+
+
 def test_a_law_with_memory_does_not_replace_the_spring_but_a_spring_does():
     assert reason((0.0, -1900.0, 0.0), "maxwell") is not None
     assert reason((0.0, -1900.0, 0.0), "gas_spring") is None

@@ -14,7 +14,7 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.effects.backlash import LIFT_OFF
 from rig.diagnosis.problem.problem import Candidate, StrutEffect, nominal, strut_constants
-from rig.diagnosis.progress import Progress, within
+from rig.diagnosis.progress import Progress, no_progress, within
 from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
 from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool, ValidatedModel
@@ -73,6 +73,7 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
         first = _search_along_motion(pool, progress)
         _try_damper_with_friction(pool)
         _try_lost_contacts(pool)
+    _try_formulas(pool)
     pool.converge_best()
     return first
 
@@ -153,6 +154,24 @@ def _try_lost_contacts(pool: Pool) -> None:
         candidate = nominal(problem).with_effects(law)
         if _SELDOM < share < 1.0 and candidate not in pool.converged:
             pool.attempt_at_nominal(candidate, {law: np.array([0.0])})
+
+
+def _try_formulas(pool: Pool) -> None:
+    """Fit the best model with every other formula for one of its laws, until none is better.
+
+    Near the noise floor a wrong formula is likelier than a missing law, and linearised about the
+    model the right one may not stand out: where it is more general, it promises nothing at all.
+    """
+    for _ in range(pool.criteria.most_laws):
+        best = pool.converge_least()
+        is_near = best.cost < pool.criteria.hopeless * pool.highest_at_floor(best)
+        if not (best.size and is_near) or pool.at_floor(best):
+            return
+        laws = best.fit.candidate.new
+        exchanges = [it for it in pool.changes(best) if len(it.laws) == len(laws)]
+        pool.attempt_changes(exchanges, no_progress)
+        if pool.least() is best:
+            return
 
 
 def _screen_single_laws(pool: Pool, progress: Progress) -> FirstRound:

@@ -1,0 +1,49 @@
+"""Near the noise floor every other formula for a law is tried."""
+
+import numpy as np
+import pytest
+
+from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.explore import _try_formulas
+from rig.diagnosis.search.pool import Pool
+from tests.diagnosis import little_bench as bench
+from tests.diagnosis.test_derivatives import model_with
+
+COEFFICIENT, EXPONENT = 60.0, 1.75
+
+
+class Orifice(bench.Nothing):
+    """Between a laminar and a turbulent flow."""
+
+    def force(self, t, z, v, state):
+        return -COEFFICIENT * np.sign(v) * np.abs(v) ** EXPONENT
+
+
+def pool_of(noise_m):
+    """The linear model, and a damper whose force goes with the square of the velocity."""
+    record = bench.run(Orifice(), noise_m=noise_m, gravity=0.0, duration_s=8.0)
+    problem = build_without_delays(bench.model(gravity=0.0), [record], 32, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    pool.attempt(model_with(problem, {(0, "quadratic_damping"): np.array([COEFFICIENT])}, {}))
+    return pool
+
+
+def test_a_damper_that_is_nearly_right_gives_way_to_the_right_formula():
+    pool = pool_of(noise_m=1e-5)
+    assert not pool.at_floor(pool.least())
+    _try_formulas(pool)
+    found = pool.least()
+    assert pool.at_floor(found)
+    assert found.fit.candidate.new == ((0, "power_damping"),)
+    assert found.fit.parts.effects == pytest.approx([COEFFICIENT, EXPONENT], rel=0.02)
+
+
+@pytest.mark.parametrize("noise_m", [1e-3, 1e-7])
+def test_at_the_floor_and_far_above_it_no_formula_is_tried(noise_m):
+    pool = pool_of(noise_m)
+    fitted = set(pool.fits)
+    _try_formulas(pool)
+    assert set(pool.fits) == fitted
