@@ -50,6 +50,7 @@ from rig.diagnosis.problem.track import force_beyond_spring, forces_along
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import (
     UNBOUND,
+    WITH_MEMORY,
     Fit,
     FitCovariance,
     effect_variables,
@@ -234,14 +235,18 @@ def channel_corrections(
     """The delays and gains that a fit left free, with their intervals.
 
     A delay at the end of its range is not what the data determine. Where no model explains the
-    data, only one counts that they show without a model: another imitates what is missing. Gains
-    are only free where without them much more is left.
+    data, only one counts that they show without a model: another imitates what is missing. Beside a
+    law with memory none does: the memory is seen as a delay without a model, too. Gains are only
+    free where without them much more is left.
     """
+    families = {effect(name).family for _, name in estimates.fit.candidate.new}
+    is_seen_without = families.isdisjoint(WITH_MEMORY)
     least_s = _OF_SAMPLING * max(grid.step_s for grid in problem.grids)
     space, corrections = estimates.fit.space, list[ChannelCorrection]()
     for i, p in enumerate(_free(problem, estimates.fit)):
         is_gain = p.kind == "height_gain"
-        if not p.channel or is_undetermined(p) or not (is_explained or p.expected or is_gain):
+        is_known = is_explained or is_gain or (p.expected and is_seen_without)
+        if not p.channel or is_undetermined(p) or not is_known:
             continue
         found = estimates.estimate(i, p.nominal)
         value = found.value - p.nominal
