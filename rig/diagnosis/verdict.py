@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dart_model.effects import CATALOGUE, effect
 from rig.diagnosis.evaluate import HeldOutLaw
 from rig.diagnosis.outcome import Confirmation, Verdict
 from rig.diagnosis.problem.problem import (
@@ -37,7 +38,8 @@ def confirmations(
     """What held-out data show of each law of the chosen model.
 
     Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
-    it whatever it is: at most the one that the data need most is confirmed.
+    it whatever it is: at most the one that the data need most is confirmed. What is left may be due
+    to its formula then, so that its family has to have others: a periodic force has none.
     """
     found: dict[StrutEffect, Confirmation] = {
         law: confirmation(it, criteria) for law, it in laws.items()
@@ -47,10 +49,18 @@ def confirmations(
     settled: set[StrutEffect] = set()
     if search.evidence and _share_left(evaluations, criteria) < criteria.leading:
         gains = {law: it.without.log_likelihood for law, it in search.evidence.items()}
-        settled.add(max(gains, key=gains.__getitem__))
+        leading = max(gains, key=gains.__getitem__)
+        if _has_other_formulas(leading[1]):
+            settled.add(leading)
     for law in {law for law, it in found.items() if it == "confirmed"} - settled:
         found[law] = "unsettled"
     return found
+
+
+def _has_other_formulas(name: str) -> bool:
+    """Whether the catalogue holds another law of a law's family."""
+    families = [item.family for item in CATALOGUE.values()]
+    return families.count(effect(name).family) > 1
 
 
 def find_reason_against_laws(

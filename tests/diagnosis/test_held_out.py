@@ -120,6 +120,11 @@ def test_far_above_the_floor_only_the_law_that_data_need_most_is_named():
     assert shown(40.0 * FLOOR_M, laws=(OTHER,)) == ["confirmed"]
 
 
+def test_far_above_the_floor_a_law_without_other_formulas_is_not_named():
+    assert shown(40.0 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["unsettled"] * 2
+    assert shown(9.0 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["confirmed"] * 2
+
+
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
     assert shown(40.0 * FLOOR_M, linear_m=1.2e-3) == ["unsettled"] * 3
 

@@ -174,10 +174,20 @@ def _without_superfluous_laws(
     """
     while True:
         laws, most = chosen.fit.candidate.new, cache(partial(_most_promising_cost, pool, chosen))
+        smaller = [
+            other
+            for law in laws
+            for other in _smaller_models(pool, chosen, law, most, progress)
+            if not pool.prefers(chosen, other)
+        ]
+        if smaller:
+            # Of two formulas for one effect that imitate each other, the better one stays.
+            chosen = min(smaller, key=lambda model: model.cost)
+            continue
         simpler = (
             other
             for law in laws
-            for other in _simpler_models(pool, chosen, law, most, progress)
+            for other in _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
             if not pool.prefers(chosen, other)
         )
         better = (
@@ -194,33 +204,33 @@ def _without_superfluous_laws(
         chosen = other
 
 
-def _simpler_models(
+def _smaller_models(
     pool: Pool,
     chosen: ValidatedModel,
     law: StrutEffect,
     most: Callable[[], float],
     progress: Progress,
 ) -> Iterable[ValidatedModel]:
-    """Models without a law of a chosen one, or with a simpler one for it; fitted on demand.
+    """Models without a law of a chosen one; fitted on demand.
 
     `most` is the largest cost along the motion from which on a fit is not tried.
     """
+    if chosen.size < 2:
+        return
     stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
     less = chosen.fit.candidate.without(law)
-    if chosen.size > 1:
-        progress(f"fitting without {law[1]}", 0.85)
-        # Its first fit may have ended in a side valley, which the larger model has left; and the
-        # larger model's linear part may suit its laws alone.
-        is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
-        is_fitted |= less in pool.converged and less in pool.invalid
-        if not is_fitted:
-            along = refine(stage, less.new, [known[other] for other in less.new])
-            if along is not None and along.validation_cost <= most():
-                pool.attempt(model_for(pool.problem, chosen.fit.model, less))
-                pool.attempt_screening(stage, pool.linear, along)
-        yield from _converge_candidate(pool, less, chosen)
-        yield from _with_more_general(pool, less, chosen, progress)
-    yield from _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
+    progress(f"fitting without {law[1]}", 0.85)
+    # Its first fit may have ended in a side valley, which the larger model has left; and the
+    # larger model's linear part may suit its laws alone.
+    is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
+    is_fitted |= less in pool.converged and less in pool.invalid
+    if not is_fitted:
+        along = refine(stage, less.new, [known[other] for other in less.new])
+        if along is not None and along.validation_cost <= most():
+            pool.attempt(model_for(pool.problem, chosen.fit.model, less))
+            pool.attempt_screening(stage, pool.linear, along)
+    yield from _converge_candidate(pool, less, chosen)
+    yield from _with_more_general(pool, less, chosen, progress)
 
 
 def _with_more_general(
