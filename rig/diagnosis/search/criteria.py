@@ -53,7 +53,8 @@ class SelectionCriteria:
             nearly right is no effect. An RMS 1.1 times the floor: half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which the residual of a
             law is attributed to its formula, and a further law has to gain far more than a better
-            formula would (`imitation`), unless one stores and one dissipates: two formulas for one
+            formula would (`imitation`), unless one stores and one dissipates, or the law is so far
+            above the noise that further ones are candidates (`settled`): two formulas for one
             effect agree to a few percent, at worst to 0.09, by the foreign formulas of
             `tests.truth`.
         imitation: Factor by which each further law then has to reduce the RMS residual, to be more
@@ -65,8 +66,9 @@ class SelectionCriteria:
         bounded: The same for the size of an effect, the linear part projected out.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
         improbable: Standard deviations of the model file's values from which on laws are not
-            believed that need such a mass, stiffness or damping, where no correction alone does:
-            one in some ten thousand is as far off (Gauss), so that the laws are the likelier error.
+            believed that need such a mass, stiffness or damping, or of what channels are late by,
+            such a delay, where no correction alone does (to two deviations): one in some ten
+            thousand is as far off (Gauss), so that the laws are the likelier error.
         leftover: Least share of a law's force along the motion that no change of the linear part
             replaces; with less the law is a linear correction. A force is seldom known to
             less (class 0.5 of ISO 7500-1 is half a percent).
