@@ -53,8 +53,7 @@ class SelectionCriteria:
             nearly right is no effect. An RMS 1.1 times the floor: half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which the residual of a
             law is attributed to its formula, and a further law has to gain far more than a better
-            formula would (`imitation`), unless one stores and one dissipates, or the law is so far
-            above the noise that further ones are candidates (`settled`): two formulas for one
+            formula would (`imitation`), unless one stores and one dissipates: two formulas for one
             effect agree to a few percent, at worst to 0.09, by the foreign formulas of
             `tests.truth`.
         imitation: Factor by which each further law then has to reduce the RMS residual, to be more

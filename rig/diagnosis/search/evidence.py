@@ -66,10 +66,8 @@ def _weigh(
         pool.converge(rival, chosen)
         rival = _nearest_rival(pool, chosen, law)
     least, level = min(subsets, key=lambda model: model.cost), pool.criteria.level
-    # Of all laws that are searched none is to be named by chance; a candidate is one for itself.
-    searched = 1 if pool.is_far_above_floor(chosen) else len(candidate_laws(pool.problem))
     return LeftOutGains(
-        _gain(chosen, least, level / searched),
+        _gain(chosen, least, level / len(candidate_laws(pool.problem))),
         None if rival is None else _gain(chosen, rival, level),
     )
 

@@ -455,7 +455,6 @@ class Pool:
         if (
             larger.size > smaller.size
             and (self.is_formula(smaller) or _adds_an_imitator(smaller, larger))
-            and not self.is_far_above_floor(smaller)
             and not _adds_a_kind(smaller, larger)
             and not self.is_imitated(larger, smaller)
             and not self.adds_dry_friction(smaller, larger)
@@ -496,13 +495,6 @@ class Pool:
     def is_formula(self, model: ValidatedModel) -> bool:
         """Whether the residual of laws is so small that it may be due to their formulas."""
         return bool(model.size) and (model.excess < self.criteria.formula**2 * self.linear.excess)
-
-    def is_far_above_floor(self, model: ValidatedModel) -> bool:
-        """Whether a model is so far above the noise floor that a further law is only a candidate.
-
-        What is left is no noise then, and a better prediction is worth having.
-        """
-        return model.cost > self.criteria.settled**2 * self.highest_at_floor(model)
 
     def is_imitated(self, larger: ValidatedModel, smaller: ValidatedModel) -> bool:
         """Whether a larger model explains so much more that a smaller one only imitates it."""
