@@ -27,7 +27,13 @@ from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
-from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel
+from rig.diagnosis.search.pool import (
+    FINAL,
+    FULL,
+    Pool,
+    ValidatedModel,
+    adds_an_imitator,
+)
 from rig.diagnosis.search.rejections import list_rejections, residual_left
 from rig.diagnosis.search.screen import (
     as_screening,
@@ -188,7 +194,8 @@ def _without_superfluous_laws(
             other
             for law in laws
             for other in _with_one_of(pool, chosen, law, effect(law[1]).simpler, most, progress)
-            if not pool.prefers(chosen, other)
+            # Beside hysteresis friction for a damper is no simpler law, but a part of a formula.
+            if not (pool.prefers(chosen, other) or adds_an_imitator(chosen, other))
         )
         better = (
             other

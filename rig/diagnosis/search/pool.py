@@ -454,7 +454,7 @@ class Pool:
             return False
         if (
             larger.size > smaller.size
-            and (self.is_formula(smaller) or _adds_an_imitator(smaller, larger))
+            and (self.is_formula(smaller) or adds_an_imitator(smaller, larger))
             and not _adds_a_kind(smaller, larger)
             and not self.is_imitated(larger, smaller)
             and not self.adds_dry_friction(smaller, larger)
@@ -555,9 +555,9 @@ def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
     )
 
 
-def _adds_an_imitator(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
+def adds_an_imitator(before: ValidatedModel, after: ValidatedModel) -> bool:
     """Whether friction is added to hysteresis, or vice versa: each corrects the other's formula."""
-    return set(larger.families) >= REMEMBERING and len(REMEMBERING & set(smaller.families)) == 1
+    return set(after.families) >= REMEMBERING and len(REMEMBERING & set(before.families)) == 1
 
 
 class Ratio(NamedTuple):
