@@ -79,6 +79,9 @@ _RIGHT, _PARTED = 100.0, 1e3
 """Mean square of a residual up to which a regression promises a nearly right model, and times that
 from which on the fit of its free run has parted from the measurement: what a model lacks is
 amplified by less."""
+_MISSED = 10.0
+"""The same ratio for a regression or linearisation that promises as many times less than the best
+model leaves: a fit that comes nowhere near is in another valley."""
 _STUCK = 2.0
 """Ratio of a converged fit's sum of squares to that of its linearisation from which on it is
 stuck: right models end at 1, beside dry friction at 1.2."""
@@ -255,9 +258,11 @@ class Pool:
             return None
         self.begun.add(key)
         result = self._refit(self.problem, begin, effort)
-        parted = result is None or result.mean_square > _PARTED * begin.promised
+        reached = np.inf if result is None else result.mean_square
+        parted = reached > _PARTED * begin.promised and begin.promised <= _RIGHT
+        missed = reached > _MISSED * begin.promised < least / self.linear.fit.rows
         is_stuck = effort is FULL and result is not None and _is_stuck(result, least)
-        if not ((parted and begin.promised <= _RIGHT) or is_stuck) or not self.held:
+        if not (parted or missed or is_stuck) or not self.held:
             return result
         for problem in self.held:
             held = self._refit(problem, begin, effort)
