@@ -57,7 +57,9 @@ def test_a_right_model_is_not_moved_by_what_holds_it():
     assert rms(held.residual(0, given.model)) < 1.05 * rms(problem.residual(0, given.model))
 
 
-def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins():
+@pytest.mark.parametrize("promised", [1.0, 1000.0])
+def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins(promised):
+    """A mean square of 1000 is no nearly right model, but far less than the linear one leaves."""
     problem = problem_of(
         WidePlay(), damping=DAMPING, duration_s=20.0, load=lambda t: 0.3 * bench.load_n(t)
     )
@@ -68,10 +70,22 @@ def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins():
     directly = fit(problem, begun, free_linear(problem, candidate), FULL)
     assert directly.mean_square > 1e6
     pool = Pool(problem, given, [linear], CRITERIA)
-    pool.attempt_changes([ModelChange(begun, float(directly.rows))], no_progress)
+    pool.attempt_changes([ModelChange(begun, promised * directly.rows)], no_progress)
     found = pool.fits[candidate].fit
     assert found.mean_square < 1.5
     assert found.parts.effects == pytest.approx([0.4, GAP_M], rel=1e-4)
+
+
+def test_a_fit_that_promised_no_more_than_the_best_model_is_left_where_it_ends():
+    problem = problem_of(
+        WidePlay(), damping=DAMPING, duration_s=20.0, load=lambda t: 0.3 * bench.load_n(t)
+    )
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    law = (0, "free_play")
+    begun = model_with(problem, {law: np.array([0.4, 1.01 * GAP_M])}, {})
+    pool.attempt_changes([ModelChange(begun, pool.linear.cost)], no_progress)
+    assert pool.fits[nominal(problem).with_effects(law)].fit.mean_square > 1e3
 
 
 def test_a_fit_is_stuck_where_its_linearisation_promises_much_less_than_the_best_model():

@@ -112,7 +112,7 @@ def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW)):
 
 
 def test_near_the_floor_all_that_held_out_data_confirm_are_named():
-    assert shown(9.0 * FLOOR_M) == ["confirmed"] * 3
+    assert shown(4.5 * FLOOR_M) == ["confirmed"] * 3
 
 
 def test_far_above_the_floor_only_the_law_that_data_need_most_is_named():
@@ -122,7 +122,7 @@ def test_far_above_the_floor_only_the_law_that_data_need_most_is_named():
 
 def test_far_above_the_floor_a_law_without_other_formulas_is_not_named():
     assert shown(40.0 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["unsettled"] * 2
-    assert shown(9.0 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["confirmed"] * 2
+    assert shown(4.5 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["confirmed"] * 2
 
 
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
