@@ -1,6 +1,6 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache, partial
 from itertools import chain
 from typing import NamedTuple
@@ -504,8 +504,8 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
     if not result.size and not pool.prefers(result, as_given := pool.validate(pool.given)):
         # Corrections that differ from zero and change nothing that can be measured.
         return _FewCorrections(as_given, chosen.fit, is_gain=False)
-    begun = _begin_with_gain(problem, result.fit, pool.criteria.significant)
-    refitted = None if begun is None else fit(problem, *begun)
+    begun = _begin_with_gain(problem, result.fit, chosen.fit, pool.criteria.significant)
+    refitted = None if begun is None else fit(problem, *begun, FINAL)
     if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
         model = _with_significant_corrections(pool, lean)
         return _FewCorrections(model, chosen.fit, is_gain=True)
@@ -598,13 +598,14 @@ def _significant_parameters(result: Fit, significant: float) -> Flags:
 
 
 def _begin_with_gain(
-    problem: Problem, result: Fit, significant: float
+    problem: Problem, result: Fit, full: Fit, significant: float
 ) -> tuple[CandidateModel, Flags] | None:
     """Where a fit with a gain in place of other corrections begins, and what is free in it, (L,).
 
-    None where a gain saves none, or is farther from the model file's tolerances.
+    None where a gain saves none, or is farther from the model file's tolerances. `full` is the fit
+    with all corrections.
     """
-    gain = _corrections_as_gain(problem, result)
+    gain = _corrections_as_gain(problem, result, full)
     if gain is None or _contradicts_prior(problem, result.parts.linear, gain[0], significant):
         return None
     linear, free = gain
@@ -620,7 +621,7 @@ def _begin_with_gain(
     return model_for(problem, bare.with_linear(linear), result.candidate, laws), free
 
 
-def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] | None:
+def _corrections_as_gain(problem: Problem, result: Fit, full: Fit) -> tuple[Array, Flags] | None:
     """Fewer corrections, one of which is the gain of the applied force; None where it saves none.
 
     The gain is degenerate with mass, stiffness and damping changed in one proportion. Those of them
@@ -632,23 +633,21 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
     linear = problem.linear
     if len(problem.motions) > 1 or not any(p.kind == "gain" for p in linear):
         return None
-    half, values = fit_covariance(result).half, result.solution.values
     scaled = {i for i, p in enumerate(linear) if p.kind in _SCALED_BY_GAIN and p.nominal > 0.0}
-    shares: dict[int, tuple[float, float]] = {}
-    for i, index in enumerate(np.flatnonzero(result.free).tolist()):
-        p = linear[index]
-        if index in scaled and values[i] > p.least:
-            known = max(half[i] * p.deviation / p.nominal, _ALIKE)
-            shares[index] = float(values[i]) / p.nominal, float(known)
+    shares, all_shares = (_shares_of_nominal(problem, it, scaled) for it in (result, full))
     alike: set[int] = set()
     for middle, _ in shares.values():
         same = {i for i, (share, known) in shares.items() if abs(share - middle) < known}
         alike = max(alike, same, key=len)
-    # For the gain to replace the others, those that did not change would have to.
-    unchanged = sum(1 for i in scaled if not result.free[i])
+    share = float(np.median([shares[i][0] for i in alike])) if alike else 0.0
+    # For the gain to replace the others, those that did not change would have to: those that are
+    # known not to have changed as much, beside laws that do not stand for them.
+    unchanged = 0
+    for i in scaled - set(np.flatnonzero(result.free).tolist()):
+        middle, known = all_shares.get(i, (0.0, _ALIKE))
+        unchanged += abs(middle - share) > known
     if len(alike) < 2 + unchanged:
         return None
-    share = float(np.median([shares[i][0] for i in alike]))
     changes, free = result.parts.linear.copy(), result.free.copy()
     for i, p in enumerate(linear):
         if p.kind == "gain":
@@ -660,6 +659,20 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
             changes[i] = (whole + changes[i]) / (1.0 + share) - whole
             free[i] |= p.kind == "preload"
     return changes, free
+
+
+def _shares_of_nominal(
+    problem: Problem, result: Fit, indices: Collection[int]
+) -> dict[int, tuple[float, float]]:
+    """Corrections as shares of the nominal values, by index, and how well each is known."""
+    half, values = fit_covariance(result).half, result.solution.values
+    shares: dict[int, tuple[float, float]] = {}
+    for i, index in enumerate(np.flatnonzero(result.free).tolist()):
+        p = problem.linear[index]
+        if index in indices and values[i] > p.least:
+            known = max(half[i] * p.deviation / p.nominal, _ALIKE)
+            shares[index] = float(values[i]) / p.nominal, float(known)
+    return shares
 
 
 def _force_at_mid_stroke(problem: Problem, parameter: LinearParameter) -> float:
