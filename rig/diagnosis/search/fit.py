@@ -66,7 +66,7 @@ _NEAR = 0.2
 """Share of the range of a delay that is searched without any law: a standard deviation."""
 WITH_MEMORY = {"hysteresis", "unmodelled_mode"}
 """Families whose force follows the motion later, as that of a late channel does."""
-_NO_PREDICTION = 100.0
+NO_PREDICTION = 100.0
 """Ratio of the sum of squares that a linearised fit without each block leaves there to that of the
 fit, from which on it predicts nothing: with impacts a free run parts from its neighbours, and a
 block that is left out moves the parameters by more than their linearisation holds."""
@@ -406,7 +406,7 @@ def validation_costs(problem: Problem, result: Fit) -> Array:
     parts = result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior
     costs, cost = leave_block_out_costs(*parts), result.solution.cost
     # Written so that costs without bound are no prediction either.
-    return costs if costs.sum() <= _NO_PREDICTION * cost else _expected_costs(*parts)
+    return costs if costs.sum() <= NO_PREDICTION * cost else _expected_costs(*parts)
 
 
 def start_variables(problem: Problem, result: Fit) -> Flags:

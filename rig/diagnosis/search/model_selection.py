@@ -233,7 +233,7 @@ def _smaller_models(
     is_fitted |= less in pool.converged and less in pool.invalid
     if not is_fitted:
         along = refine(stage, less.new, [known[other] for other in less.new])
-        if along is not None and along.validation_cost <= most():
+        if along is not None and along.promising_cost <= most():
             pool.attempt(model_for(pool.problem, chosen.fit.model, less))
             pool.attempt_screening(stage, pool.linear, along)
     yield from _converge_candidate(pool, less, chosen)
@@ -288,7 +288,7 @@ def _with_one_of(
         progress(f"fitting {name} instead of {law[1]}", 0.85)
         if candidate not in pool.fits:
             for screening in rank_laws(stage, as_screening(less.new, known), 1, [other]):
-                if screening.values and screening.validation_cost <= most():
+                if screening.values and screening.promising_cost <= most():
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
             _attempt_about_model_file(pool, chosen, law, other)
         yield from _converge_candidate(pool, candidate, chosen)
@@ -370,7 +370,7 @@ def _attempt_plainer(pool: Pool, unidentified: ValidatedModel) -> None:
         for screening in rank_laws(pool.linear_stage, base, len(plainer), plainer)[
             : pool.criteria.fitted_a_size
         ]:
-            if screening.values and screening.validation_cost <= most:
+            if screening.values and screening.promising_cost <= most:
                 pool.attempt_screening(pool.linear_stage, pool.linear, screening, FULL)
 
 

@@ -40,7 +40,7 @@ from rig.diagnosis.problem.problem import (
     strut_effects,
 )
 from rig.diagnosis.problem.track import largest_stride, segment_forces
-from rig.diagnosis.search.fit import law_space, leave_block_out_costs
+from rig.diagnosis.search.fit import NO_PREDICTION, law_space, leave_block_out_costs
 
 Array = NDArray[np.float64]
 
@@ -119,6 +119,15 @@ class Screening(NamedTuple):
     def validation_cost(self) -> float:
         """Out-of-sample sum of squares."""
         return float(self.block_costs.sum())
+
+    @property
+    def promising_cost(self) -> float:
+        """The same, but that of the fit where this predicts nothing: a contact of a single block.
+
+        It decides whether a simulation is tried, which costs little.
+        """
+        predicts = self.validation_cost <= NO_PREDICTION * self.cost
+        return self.validation_cost if predicts else self.cost
 
 
 def stage_of(problem: Problem, reference: CandidateModel) -> Stage:
