@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import Motion
-from rig.diagnosis.numerics.laws import CUBE, MATRIX, compile_loop
+from rig.diagnosis.numerics.laws import CUBE, MATRIX, compile_loop, inline
 from rig.diagnosis.problem import linear_part
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.mechanism import LinearisedMechanism, solve_nearest
@@ -47,6 +47,14 @@ def _respond_as_one(
                 u, v = a00 * u + a01 * v + b0 * f + c0 * g, a10 * u + a11 * v + b1 * f + c1 * g
 
 
+@inline
+def _row_product(matrix: Array, i: int, rows: Array, k: int) -> float:
+    total = 0.0
+    for j in range(rows.shape[1]):
+        total += matrix[i, j] * rows[k, j]
+    return total
+
+
 def _respond_alone(
     transition: Array,
     early: Array,
@@ -71,11 +79,8 @@ def _respond_alone(
             total = 0.0
             for j in range(size):
                 total += transition[i, j] * x[j]
-            before = 0.0
-            after = 0.0
-            for j in range(directions.shape[1]):
-                before += early[i, j] * directions[k, j]
-                after += late[i, j] * directions[k + 1, j]
+            before = _row_product(early, i, directions, k)
+            after = _row_product(late, i, directions, k + 1)
             y[i] = total + before * forces[k, 0] + after * forces[k + 1, 0]
         x, y = y, x
 
@@ -103,11 +108,8 @@ def _respond_together(
         if k + 1 == samples:
             break
         for i in range(size):
-            before = 0.0
-            after = 0.0
-            for j in range(directions.shape[1]):
-                before += early[i, j] * directions[k, j]
-                after += late[i, j] * directions[k + 1, j]
+            before = _row_product(early, i, directions, k)
+            after = _row_product(late, i, directions, k + 1)
             for c in range(columns):
                 y[i, c] = before * forces[k, c] + after * forces[k + 1, c]
             for j in range(size):

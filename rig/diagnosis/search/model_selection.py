@@ -27,13 +27,7 @@ from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
-from rig.diagnosis.search.pool import (
-    FINAL,
-    FULL,
-    Pool,
-    ValidatedModel,
-    adds_an_imitator,
-)
+from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel, adds_an_imitator
 from rig.diagnosis.search.rejections import list_rejections, residual_left
 from rig.diagnosis.search.screen import (
     as_screening,
