@@ -12,7 +12,9 @@ from pathlib import Path
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.progress import Progress, within
 from rig.pages.report import write_report
+from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
+from tests.scoreboard.emps_friction import friction_rows
 from tests.scoreboard.starts import one_body
 from tests.scoreboard.table import CORRECTED, START, Row, findings
 
@@ -26,7 +28,10 @@ _MM_PER_M = 1000.0
 
 
 def emps_rows(data_folder: Path | None, out: Path, progress: Progress) -> list[Row]:
-    """Free-run error of either run, learnt from the other; none without the set."""
+    """Free-run error of either run, learnt from the other, and what each says about friction.
+
+    None without the set.
+    """
     if data_folder is None:
         return []
     files = {name: data_folder / "emps" / f"{name}.csv" for name in _RUNS}
@@ -49,4 +54,6 @@ def emps_rows(data_folder: Path | None, out: Path, progress: Progress) -> list[R
         rows.append(Row(_NAME, test, START, _MM_PER_M * error.before, _UNIT, start))
         how = f"computed here, trained on `{learnt}`; {findings(result.diagnosis)}"
         rows.append(Row(_NAME, test, CORRECTED, _MM_PER_M * error.after, _UNIT, how))
-    return rows
+    progress(f"{_NAME}: friction that each recording asks for", 1.0)
+    strut = [model.struts[0].name]
+    return rows + friction_rows({name: read_recording(files[name], strut) for name in _RUNS})
