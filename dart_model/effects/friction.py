@@ -32,10 +32,10 @@ _PRESLIDING = Parameter(
     "presliding_m", "m", 1e-12, 1e4, "deflection at which the bristle carries the sliding friction"
 )
 
-# A bristle settles at |velocity| / presliding, without bound; faster than this rate (1/s), a step of
-# the integrator would have to be shorter. A deflection that settles more slowly than it should lags
-# behind its sliding value more than it should, in the ratio of the two rates: forces take the excess
-# off. Without that, bristles of 27 µm left an error of 2 µm in a free run, with it 0.5 µm.
+# A bristle settles at |velocity| / presliding, without bound; beyond this rate (1/s) a step of the
+# integrator would have to be shorter. With the rate limited the deflection lags behind its sliding
+# value by more than it should, in the ratio of the two rates: forces take the excess off. Without
+# that, bristles of 27 µm left an error of 2 µm in a free run, with it 0.5 µm.
 _FASTEST_SETTLING_PER_S = 2000.0
 _DEFLECTION = State("deflection", 1.0)
 """Of a bristle, in units of `presliding_m`."""

@@ -9,6 +9,8 @@ import pytest
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_step
 from rig.diagnosis.problem.channel_delays import known_share, late_columns, late_reader
+from rig.diagnosis.problem.problem import Candidate, LinearParameter
+from rig.diagnosis.search.fit import linear_bounds
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis import test_planted_effects as driven
@@ -177,6 +179,21 @@ def test_a_memory_that_is_explained_in_part_is_no_delay():
     assert (found.verdict, laws(found)) == ("partly_explained", {"hysteresis"})
     assert not found.channels
     assert "delay" not in {effect.family for effect in found.effects}
+
+
+def bounds_ms(law, least_ms, most_ms):
+    expected_s = 0.5e-3 * (least_ms + most_ms)
+    delay = LinearParameter(
+        0, "delay", 0.0, 2e-3, 1e-3 * least_ms, -1, "height_m:strut", 1e-3 * most_ms, expected_s
+    )
+    low, high = linear_bounds(delay, Candidate((), ((0, law),)))
+    return 1e3 * low, 1e3 * high
+
+
+def test_beside_a_law_with_memory_any_delay_of_usual_channels_is_possible_and_no_longer_one():
+    assert bounds_ms("dahl", 1.0, 3.0) == pytest.approx((-8.0, 8.0))
+    assert bounds_ms("dahl", 19.0, 21.0) == pytest.approx((-8.0, 21.0))
+    assert bounds_ms("coulomb_friction", 1.0, 3.0) == pytest.approx((1.0, 3.0))
 
 
 @pytest.mark.parametrize(

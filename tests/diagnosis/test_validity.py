@@ -37,9 +37,6 @@ STIFFNESS = LinearParameter(0, "stiffness", 2000.0, 400.0, -2000.0)
 DAMPING = LinearParameter(0, "damping", 100.0, 40.0, -100.0)
 
 
-DELAY = LinearParameter(0, "delay", 0.0, 2e-3, -0.1, -1, "height_m:strut", 0.1)
-
-
 def reason(changes, law, lawless=(0.0, 0.0, 0.0), linear=(MASS, STIFFNESS, DAMPING)):
     problem = SimpleNamespace(linear=linear)
     return validity.find_improbable_linear_part(
@@ -61,18 +58,6 @@ def test_a_correction_that_no_law_makes_larger_says_nothing_against_the_law():
 def test_the_best_linear_model_is_bent_by_what_it_lacks():
     assert reason((2.6, 0.0, 0.0), "coulomb_friction", lawless=(1.9, 0.0, 0.0)) is None
     assert reason((3.1, 0.0, 0.0), "coulomb_friction", lawless=(1.9, 0.0, 0.0)) is not None
-
-
-def test_a_law_that_needs_a_channel_to_be_late_beyond_what_channels_are_is_not_believed():
-    assert reason((7.9e-3,), "dahl", (0.0,), (DELAY,)) is None
-    why = reason((-11e-3,), "dahl", (0.0,), (DELAY,))
-    assert why is not None
-    assert "height_m:strut to be late by -11 ms, 5.5 standard deviations" in why
-
-
-def test_a_delay_that_the_best_linear_model_shows_says_nothing_against_a_law():
-    assert reason((22e-3,), "dahl", (20e-3,), (DELAY,)) is None
-    assert reason((-11e-3,), "dahl", (10e-3,), (DELAY,)) is not None
 
 
 def test_a_law_with_memory_does_not_replace_the_spring_but_a_spring_does():

@@ -658,6 +658,38 @@ def test_lugre_slides_with_its_stribeck_curve():
     )
 
 
+def unlimited_lugre_n(parameters, velocity, h):
+    """Forces of bristles that settle as fast as they like, by exact steps of a held velocity."""
+    coulomb_n, static, stribeck, presliding_m, damping = parameters
+    deflection, forces_n = 0.0, []
+    for v in velocity:
+        fall = math.exp(-((v / stribeck) ** 2))
+        level, speed = 1.0 + (static - 1.0) * fall, abs(v) / presliding_m
+        settled = math.copysign(level, v)
+        deflection = settled + (deflection - settled) * math.exp(-speed / level * h)
+        bending = (math.copysign(speed, v) - speed * deflection / level) * presliding_m
+        forces_n.append(-coulomb_n * deflection - damping * fall * bending)
+    return forces_n
+
+
+def test_bristles_that_settle_faster_than_the_limit_slide_as_if_there_were_none():
+    # Bristles of 20 µm at up to 0.4 m/s would settle at 20 000/s, ten times the limit.
+    parameters, h = [27.0, 1.5, 0.07, 2e-5, 2000.0], 1e-5
+    velocity = [0.4 * math.sin(12.0 * h * k) for k in range(60_000)]
+    exact_n = unlimited_lugre_n(parameters, velocity, h)
+    deflection, errors_n, late_n = 0.0, [], []
+    for v, expected_n in zip(velocity, exact_n, strict=True):
+        state = (deflection,)
+        errors_n.append(force("lugre_friction", parameters, velocity=v, state=state) - expected_n)
+        late_n.append(-27.0 * deflection - expected_n)
+        deflection += h * rate("lugre_friction", parameters, velocity=v, state=state)[0]
+    assert max(map(abs, errors_n)) < 0.15
+    sliding = [k for k, v in enumerate(velocity) if abs(v) > 0.06]
+    assert max(abs(errors_n[k]) for k in sliding) < 0.01
+    # The deflection alone is late by a hundred times as much.
+    assert max(abs(late_n[k]) for k in sliding) > 0.5
+
+
 def test_energy_fade_counts_the_work_of_the_faded_damper():
     out = rate("energy_fade", [0.5, 10.0], velocity=2.0, state=(1e9,))
     assert out == pytest.approx([0.5 * 100.0 * 4.0])

@@ -66,13 +66,15 @@ def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
     """A delay that is searched for from an estimate on, of which the recordings know the error.
 
-    Of a vague estimate, none at all remains possible.
+    Of a vague estimate, none at all remains possible, and what goes farther is what channels are.
     """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
     width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
     least, most = expected_s - width_s, expected_s + width_s
     if std_s > _VAGUE_S:
-        least, most = min(least, -_LEAST_WIDTH_S), max(most, _LEAST_WIDTH_S)
+        farthest_s = SIGNIFICANT * parameter.deviation
+        least = max(min(least, -_LEAST_WIDTH_S), min(expected_s, 0.0) - farthest_s)
+        most = min(max(most, _LEAST_WIDTH_S), max(expected_s, 0.0) + farthest_s)
     return parameter._replace(expected=expected_s, least=least, most=most)
 
 

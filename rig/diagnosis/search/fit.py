@@ -34,7 +34,7 @@ from rig.diagnosis.numerics.least_squares import (
     concatenate_spaces,
     solve,
 )
-from rig.diagnosis.problem.channel_delays import LONGEST_S, is_undetermined
+from rig.diagnosis.problem.channel_delays import SIGNIFICANT, is_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
@@ -172,18 +172,20 @@ def _existing_space(name: str, values: Array, free: bool) -> Space:
     return Space(low, high, np.maximum(np.abs(values), 1e-12), (low > 0.0) & free)
 
 
-def _bounds(parameter: LinearParameter, candidate: Candidate) -> tuple[float, float]:
+def linear_bounds(parameter: LinearParameter, candidate: Candidate) -> tuple[float, float]:
     """Lowest and highest change of a linear parameter in a fit of a candidate.
 
     The first estimate of a delay is that of a strut without memory; a law that has one may itself
-    be what was taken for the delay. Without any law a delay stays near its estimate: it would
+    be what was taken for the delay. Then any delay is possible that channels have: longer ones
+    would do a part of the law's work. Without any law a delay stays near its estimate: it would
     imitate what is missing, and laws would be sought along another motion than the measured one.
     """
     if parameter.kind != "delay":
         return parameter.least, parameter.most
     families = {effect(name).family for _, name in candidate.new}
     if not families.isdisjoint(WITH_MEMORY):
-        return -LONGEST_S, LONGEST_S
+        usual_s = SIGNIFICANT * parameter.deviation
+        return min(parameter.least, -usual_s), max(parameter.most, usual_s)
     share = 1.0 if families or is_undetermined(parameter) else _NEAR
     low, middle, high = parameter.least, parameter.expected, parameter.most
     return middle - share * (middle - low), middle + share * (high - middle)
@@ -197,7 +199,7 @@ class _Layout:
         self.problem, self.candidate, self.first, self.free = problem, candidate, first, free
         linear = problem.linear
         deviation = np.array([p.deviation for p in linear])
-        bounds = [_bounds(p, candidate) for p in linear]
+        bounds = [linear_bounds(p, candidate) for p in linear]
         spaces = [
             Space(
                 np.array([low for low, _ in bounds]),

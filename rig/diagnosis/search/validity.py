@@ -47,7 +47,6 @@ _REPLACED = {
     "mass": (),
     "stiffness": ("nonlinear_stiffness", "stop", "backlash"),
     "damping": ("nonlinear_damping", "friction", "fade"),
-    "delay": (),
 }
 """Linear parameters whose priors rule laws out, and the families that may replace each."""
 _FARTHER = 2.0
@@ -196,12 +195,6 @@ def find_improbable_linear_part(
         times = abs(float(change)) / p.deviation
         farther = float(np.sign(change) * (change - alone)) / p.deviation
         if times > criteria.improbable and farther > _FARTHER and not is_replaced:
-            if p.kind == "delay":
-                return (
-                    f"it requires {p.channel} to be late by {1e3 * float(change):.3g} ms, "
-                    f"{times:.2g} standard deviations of what channels are "
-                    f"({1e3 * p.deviation:.2g} ms; a known delay is stated with the channel)"
-                )
             return (
                 f"it requires {PARAMETERS[p.kind]} {p.nominal + float(change):.3g}, "
                 f"{times:.2g} standard deviations from the model file's {p.nominal:.3g} "
