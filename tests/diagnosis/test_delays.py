@@ -199,7 +199,7 @@ def test_beside_a_law_with_memory_any_delay_of_usual_channels_is_possible_and_no
 @pytest.mark.parametrize(
     ("effect", "delay_s", "rivals"),
     [
-        (dyno.Nothing, 4e-3, {"delay"}),
+        (dyno.Nothing, 3e-3, {"delay"}),
         (prescribed.Relaxing, 0.0, {"hysteresis", "delay"}),
         (prescribed.Relaxing, 3e-3, {"hysteresis", "delay"}),
     ],

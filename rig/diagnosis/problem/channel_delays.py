@@ -33,9 +33,13 @@ SIGNIFICANT = 4.0
 GAIN_STD, MOST_GAIN = 0.02, 0.2
 """Standard deviation of the prior on a height's gain, and its largest change: displacement sensors
 are calibrated to a percent or better, and wired with a wrong range now and then."""
-UNKNOWN_S = 0.01
-"""Longest delay that is considered where the data do not show it: a fit of an unknown one would
-only replace damping."""
+_HELD_S = 1e-6
+"""Largest change of a delay that the data do not show. It has the effect of corrections of
+stiffness and damping, beside which a fit would choose whatever makes up for a law's wrong shape at
+one frequency, and is wrong at any other; so it is what the recording states. Intervals contain the
+deviation of its prior all the same, for which its range must have room for a difference."""
+_UNKNOWN_S = 0.01
+"""Longest such delay that is considered in place of corrections of stiffness and damping."""
 
 
 class Delays(NamedTuple):
@@ -89,12 +93,20 @@ def height_gains(spec: ModelSpec) -> tuple[LinearParameter, ...]:
 
 def is_undetermined(parameter: LinearParameter) -> bool:
     """Whether it is a delay of which the data showed nothing before the search."""
-    return parameter.kind == "delay" and parameter.most == -parameter.least == UNKNOWN_S
+    ends = (-parameter.least, parameter.most)
+    return parameter.kind == "delay" and ends in ((_HELD_S,) * 2, (_UNKNOWN_S,) * 2)
+
+
+def search_undetermined(linear: Sequence[LinearParameter]) -> tuple[LinearParameter, ...]:
+    """Linear parameters of which delays are searched for that the data did not show."""
+    return tuple(
+        p._replace(least=-_UNKNOWN_S, most=_UNKNOWN_S) if is_undetermined(p) else p for p in linear
+    )
 
 
 def _parameter(recording: Recording, strut: int, index: int, channel: str) -> LinearParameter:
     known_s = recording.delays_s.get(channel, 0.0)
-    return LinearParameter(strut, "delay", known_s, STD_S, -UNKNOWN_S, index, channel, UNKNOWN_S)
+    return LinearParameter(strut, "delay", known_s, STD_S, -_HELD_S, index, channel, _HELD_S)
 
 
 def delays_of(

@@ -180,13 +180,13 @@ def linear_bounds(parameter: LinearParameter, candidate: Candidate) -> tuple[flo
     would do a part of the law's work. Without any law a delay stays near its estimate: it would
     imitate what is missing, and laws would be sought along another motion than the measured one.
     """
-    if parameter.kind != "delay":
+    if parameter.kind != "delay" or is_undetermined(parameter):
         return parameter.least, parameter.most
     families = {effect(name).family for _, name in candidate.new}
     if not families.isdisjoint(WITH_MEMORY):
         usual_s = SIGNIFICANT * parameter.deviation
         return min(parameter.least, -usual_s), max(parameter.most, usual_s)
-    share = 1.0 if families or is_undetermined(parameter) else _NEAR
+    share = 1.0 if families else _NEAR
     low, middle, high = parameter.least, parameter.expected, parameter.most
     return middle - share * (middle - low), middle + share * (high - middle)
 

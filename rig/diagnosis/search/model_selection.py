@@ -1,6 +1,7 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from itertools import chain
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from dart_model.effects import effect
 from dart_model.effects.calling import arguments
 from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
-from rig.diagnosis.problem.channel_delays import is_undetermined
+from rig.diagnosis.problem.channel_delays import is_undetermined, search_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
@@ -442,11 +443,12 @@ def _with_delays_instead(
     pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int]
 ) -> ValidatedModel | None:
     """The chosen model with delays in place of one or all of its corrections."""
+    problem = replace(pool.problem, linear=search_undetermined(pool.problem.linear))
     for dropped in (corrected, *([i] for i in corrected)):
         linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
         linear[list(dropped)], free[list(dropped)], free[list(unknown)] = 0.0, False, True
         first = chosen.fit.model.with_linear(linear)
-        result = fit(pool.problem, first, free, FINAL)
+        result = fit(problem, first, free, FINAL)
         if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
             return rival
     return None
