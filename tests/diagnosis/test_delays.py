@@ -9,6 +9,7 @@ import pytest
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_step
 from rig.diagnosis.problem.channel_delays import known_share, late_columns, late_reader
+from rig.diagnosis.problem.delay_estimate import _about
 from rig.diagnosis.problem.problem import Candidate, LinearParameter
 from rig.diagnosis.search.fit import linear_bounds
 from tests.diagnosis import little_bench as bench
@@ -194,6 +195,15 @@ def test_beside_a_law_with_memory_any_delay_of_usual_channels_is_possible_and_no
     assert bounds_ms("dahl", 1.0, 3.0) == pytest.approx((-8.0, 8.0))
     assert bounds_ms("dahl", 19.0, 21.0) == pytest.approx((-8.0, 21.0))
     assert bounds_ms("coulomb_friction", 1.0, 3.0) == pytest.approx((1.0, 3.0))
+
+
+def test_a_vague_estimate_leaves_zero_and_the_delays_of_usual_channels():
+    delay = LinearParameter(0, "delay", 0.0, 2e-3, 0.0, -1, "strut_force_n:strut")
+    known, vague = _about(delay, 20e-3, 0.01e-3), _about(delay, 12e-3, 2e-3)
+    assert (known.least, known.most) == pytest.approx((19e-3, 21e-3))
+    assert (vague.least, vague.most) == pytest.approx((-1e-3, 20e-3))
+    shown_by_nothing = _about(delay, 5e-3, 4e-3)
+    assert (shown_by_nothing.least, shown_by_nothing.most) == pytest.approx((-8e-3, 8e-3))
 
 
 @pytest.mark.parametrize(

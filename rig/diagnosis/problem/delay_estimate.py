@@ -66,7 +66,8 @@ def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:
 def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearParameter:
     """A delay that is searched for from an estimate on, of which the recordings know the error.
 
-    Of a vague estimate, none at all remains possible, and what goes farther is what channels are.
+    About a vague estimate zero remains possible, and what usual channels add to it: no more than
+    four deviations of the prior.
     """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
     width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
