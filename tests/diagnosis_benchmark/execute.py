@@ -18,6 +18,7 @@ from rig.recordings.recording import RecordingError
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
 from tests.diagnosis_benchmark.live import live_force
+from tests.diagnosis_benchmark.live_moving import live_force_of_moving
 from tests.diagnosis_benchmark.moving import MovingCase, write_moving
 from tests.diagnosis_benchmark.plan import Slot, fill, ratios_of
 from tests.truth.files import write_case
@@ -47,7 +48,11 @@ def _follow(
     case: Case | MovingCase, corrected: ModelSpec | None, diagnosis: dict, folder: Path
 ) -> float | None:
     """How a corrected model follows the held-out run, as `Result.live_force_ratio`."""
-    if corrected is None or isinstance(case, MovingCase) or case.is_dyno:
+    if corrected is None:
+        return None
+    if isinstance(case, MovingCase):
+        return live_force_of_moving(case, corrected)
+    if case.is_dyno:
         return None
     return live_force(
         corrected,

@@ -58,9 +58,9 @@ class Result:
         overlaps: Of where stops and knees show with where they were planted (F1).
         duration_s: Wall time of the diagnosis.
         live_force_ratio: RMS residual force that an observer finds of the corrected model over its
-            floor (see `live_force`), while it follows the held-out run with tuned gains; infinite
-            where the loop is unstable or a force is not finite; None on a dyno and with a base that
-            is moved.
+            floor (see `live_force`, `live_force_of_moving`), while it follows the held-out run with
+            tuned gains; infinite where the loop is unstable or a force is not finite; None on a
+            dyno.
         message: What went wrong, if it failed.
     """
 

@@ -70,11 +70,11 @@ class MovingCase:
 def make_moving(seed: int, kind: str) -> MovingCase:
     """Draw a case; equal seeds and kinds give equal cases."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    bench, spec = _bench(kind), _model(kind)
+    bench, spec = nominal_bench(kind), nominal_model(kind)
     struts = [strut.name for strut in spec.struts if strut.name.startswith("suspension")]
     names = rng.choice(list(FAMILIES), size=rng.choice([1, 1, 2, 3]), replace=False).tolist()
     where = [str(rng.choice(struts))] * len(names)
-    still = _moved(bench, seed)
+    still = moved_otherwise(bench, seed)
     heights = _simulated(still, TRAIN_S).height_m
     columns = {strut.name: index for index, strut in enumerate(bench.struts)}
     effects = tuple(
@@ -93,7 +93,7 @@ def _effect(rng, name: str, strut: str, heights_m) -> UndeclaredEffect:
     return UndeclaredEffect(name=name, strut=strut, parameters=values)
 
 
-def _bench(kind: str) -> BenchConfig:
+def nominal_bench(kind: str) -> BenchConfig:
     if kind == "moving_posts":
         return load_bench_config(CONFIGS / "four_post_bench.yaml")
     bench = load_bench_config(CONFIGS / "quarter_car_road_bench.yaml")
@@ -115,7 +115,7 @@ def _bench(kind: str) -> BenchConfig:
     return BenchConfig.model_validate(content)
 
 
-def _model(kind: str) -> ModelSpec:
+def nominal_model(kind: str) -> ModelSpec:
     if kind == "moving_posts":
         return load_model(MODELS / "four_post.yaml")
     spec = load_model(MODELS / "quarter_car_road.yaml")
@@ -154,7 +154,7 @@ def _rough(rng, spec: ModelSpec) -> ModelSpec:
     return spec.model_copy(update={"skeleton": skeleton, "struts": struts})
 
 
-def _moved(bench: BenchConfig, seed: int) -> BenchConfig:
+def moved_otherwise(bench: BenchConfig, seed: int) -> BenchConfig:
     """The bench with motions of its own, from a seed."""
     motions: list[StrutMotion] = []
     for place, motion in enumerate(bench.prescribed_motion):
@@ -189,7 +189,7 @@ def write_moving(case: MovingCase, folder: Path) -> None:
 
 
 def _columns(case: MovingCase, duration_s: float, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    course = _simulated(_moved(case.bench, seed), duration_s)
+    course = _simulated(moved_otherwise(case.bench, seed), duration_s)
     rng = np.random.default_rng(seed)
     heights = course.height_m + NOISE_M[case.kind] * rng.standard_normal(course.height_m.shape)
     names = [strut.name for strut in case.bench.struts]
@@ -204,7 +204,7 @@ def _columns(case: MovingCase, duration_s: float, seed: int) -> Iterator[tuple[s
 
 def moving_ratios(case: MovingCase) -> tuple[float, ...]:
     """RMS force of each effect in the run that is diagnosed, over that of the noise."""
-    course = _simulated(_moved(case.bench, 2 * case.seed + 1), TRAIN_S)
+    course = _simulated(moved_otherwise(case.bench, 2 * case.seed + 1), TRAIN_S)
     columns = {strut.name: index for index, strut in enumerate(case.bench.struts)}
     floor_n = force_noise_floor_n(case)
     found: list[float] = []

@@ -86,7 +86,9 @@ of the stroke in which a stop shows, and of the speeds at which a knee does, wit
 they were planted (twice what is common over the sum of both). *Runs live* is the share of corrected
 models that follow the held-out run tick by tick at its rate, with the gains that `rig tune` finds
 for them: the loop is stable, no force is infinite, and where all is explained the residual force
-that the observer finds is at most {LIVE_MULTIPLE:g} times its floor. The durations depend on the
+that the observer finds is at most {LIVE_MULTIPLE:g} times its floor. With a moved base they run in
+lockstep with their bench, which moves as in the held-out run, with Kalman filters, whose gains are
+computed from the model. The durations depend on the
 load of the machine, which is stated at the end of the page.
 """
 

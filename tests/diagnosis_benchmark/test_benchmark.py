@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -30,6 +31,8 @@ from tests.diagnosis_benchmark.judge import (
     judge,
 )
 from tests.diagnosis_benchmark.live import live_force
+from tests.diagnosis_benchmark.live_moving import live_force_of_moving
+from tests.diagnosis_benchmark.moving import make_moving, nominal_bench, nominal_model
 from tests.diagnosis_benchmark.plan import GROUPS, Slot, fill, part_of, slots
 from tests.diagnosis_benchmark.summary import (
     COLUMNS,
@@ -477,3 +480,11 @@ def test_a_model_follows_its_bench_and_another_does_not():
     )
     assert right < 2.0  # The applied force is held for a tick.
     assert wrong > 5.0
+
+
+@pytest.mark.slow
+def test_a_right_model_of_a_moved_bench_leaves_noise_alone_and_a_rough_one_does_not():
+    case = make_moving(7, "moving_shaker")
+    complete = replace(case, bench=nominal_bench(case.kind), effects=())
+    assert live_force_of_moving(complete, nominal_model(case.kind)) == pytest.approx(1.0, abs=0.2)
+    assert live_force_of_moving(case, case.model) > 5.0
