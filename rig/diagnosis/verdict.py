@@ -1,6 +1,6 @@
 """The verdict on a diagnosis: what held-out data show of the chosen model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rig.diagnosis.problem.problem import (
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import Fit
 from rig.diagnosis.search.model_selection import SearchResult
+from rig.diagnosis.search.screen import reads_alone
 
 HeldOutLaws = Mapping[StrutEffect, HeldOutLaw]
 """What held-out data say of each law of the chosen model."""
@@ -39,7 +40,8 @@ def confirmations(
 
     Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
     it whatever it is: at most the one that the data need most is confirmed. What is left may be due
-    to its formula then, so that its family has to have others: a periodic force has none.
+    to its formula then, so that its family has to have others: a periodic force has none. Two laws
+    of a strut that are functions of its height alone are one curve, whose parts are not confirmed.
     """
     found: dict[StrutEffect, Confirmation] = {
         law: confirmation(it, criteria) for law, it in laws.items()
@@ -50,7 +52,7 @@ def confirmations(
     if search.evidence and _share_left(evaluations, criteria) < criteria.leading:
         gains = {law: it.without.log_likelihood for law, it in search.evidence.items()}
         leading = max(gains, key=gains.__getitem__)
-        if _has_other_formulas(leading[1]):
+        if _has_other_formulas(leading[1]) and not _is_part_of_curve(leading, gains):
             settled.add(leading)
     for law in {law for law, it in found.items() if it == "confirmed"} - settled:
         found[law] = "unsettled"
@@ -61,6 +63,12 @@ def _has_other_formulas(name: str) -> bool:
     """Whether the catalogue holds another law of a law's family."""
     families = [item.family for item in CATALOGUE.values()]
     return families.count(effect(name).family) > 1
+
+
+def _is_part_of_curve(law: StrutEffect, laws: Iterable[StrutEffect]) -> bool:
+    """Whether a law and another one of its strut are both functions of the height alone."""
+    curves = [it for it in laws if it[0] == law[0] and reads_alone(it[1], "height_m")]
+    return law in curves and len(curves) > 1
 
 
 def find_reason_against_laws(

@@ -31,6 +31,7 @@ from rig.diagnosis.outcome import (
     White,
 )
 from rig.diagnosis.problem.channel_delays import SIGNIFICANT, is_undetermined
+from rig.diagnosis.problem.delay_estimate import LEAST_WIDTH_S
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
@@ -235,9 +236,10 @@ def channel_corrections(
     """The delays and gains that a fit left free, with their intervals.
 
     A delay at the end of its range is not what the data determine. Where no model explains the
-    data, only one counts that they show without a model: another imitates what is missing. Beside a
-    law with memory none does: the memory is seen as a delay without a model, too. Gains are only
-    free where without them much more is left.
+    data, only one counts that they show without a model, and that is longer than what such an
+    estimate was wrong by: another imitates what is missing. Beside a law with memory none does: the
+    memory is seen as a delay without a model, too. Gains are only free where without them much more
+    is left.
     """
     families = {effect(name).family for _, name in estimates.fit.candidate.new}
     is_seen_without = families.isdisjoint(WITH_MEMORY)
@@ -245,11 +247,13 @@ def channel_corrections(
     space, corrections = estimates.fit.space, list[ChannelCorrection]()
     for i, p in enumerate(_free(problem, estimates.fit)):
         is_gain = p.kind == "height_gain"
-        is_known = is_explained or is_gain or (p.expected and is_seen_without)
-        if not p.channel or is_undetermined(p) or not is_known:
+        if not p.channel or is_undetermined(p):
             continue
         found = estimates.estimate(i, p.nominal)
         value = found.value - p.nominal
+        is_shown = is_seen_without and min(abs(p.expected), abs(value)) > LEAST_WIDTH_S
+        if not (is_explained or is_gain or is_shown):
+            continue
         is_at_end = min(value - space.low[i], space.high[i] - value) < _AT_BOUND * abs(value)
         if found.low is None or found.high is None or is_at_end:
             found = Estimate(found.value, None, None)

@@ -1,4 +1,6 @@
-"""Near the noise floor every other formula for a law is tried."""
+"""Near the noise floor every other formula for a law is tried, and further laws that tie."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import pytest
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.explore import _try_formulas
+from rig.diagnosis.search.explore import _promising, _try_formulas
 from rig.diagnosis.search.pool import Pool
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.test_derivatives import model_with
@@ -47,3 +49,21 @@ def test_at_the_floor_and_far_above_it_no_formula_is_tried(noise_m):
     fitted = set(pool.fits)
     _try_formulas(pool)
     assert set(pool.fits) == fitted
+
+
+def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():
+    friction = (0, "stribeck_friction")
+
+    def change(cost, name):
+        return SimpleNamespace(cost=cost, laws=(friction, (0, name)))
+
+    promised = {
+        "stroke_damping": 100.0,
+        "end_zone_damping": 100.5,
+        "position_dependent_damping": 101.0,
+        "cubic_stiffness": 102.0,
+        "zone_damping": 150.0,
+    }
+    changes = [change(cost, name) for name, cost in promised.items()]
+    fitted = {it.laws[1][1] for it in _promising(changes, [friction], 4)}
+    assert fitted == set(promised) - {"zone_damping"}

@@ -125,6 +125,14 @@ def test_far_above_the_floor_a_law_without_other_formulas_is_not_named():
     assert shown(4.5 * FLOOR_M, laws=((0, "periodic_force"), MORE)) == ["confirmed"] * 2
 
 
+def test_far_above_the_floor_parts_of_one_curve_are_not_named():
+    spring = (0, "power_stiffness")
+    assert shown(40.0 * FLOOR_M, laws=(spring, OTHER)) == ["unsettled"] * 2
+    assert shown(40.0 * FLOOR_M, laws=(spring, (1, "backlash"))) == ["confirmed", "unsettled"]
+    assert shown(40.0 * FLOOR_M, laws=(LAW, spring, OTHER))[0] == "confirmed"
+    assert shown(4.5 * FLOOR_M, laws=(spring, OTHER)) == ["confirmed"] * 2
+
+
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
     assert shown(40.0 * FLOOR_M, linear_m=1.2e-3) == ["unsettled"] * 3
 

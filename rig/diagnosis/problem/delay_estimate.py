@@ -22,10 +22,11 @@ _ITERATIONS = 6
 """Most steps; the fit that follows searches about what they reach."""
 _WIDTH = 5.0
 """Standard deviations about an estimate within which a delay is searched for."""
-_LEAST_WIDTH_S = 1e-3
-"""Least time for which that is: the functions of the estimate bend less than a stop, whose contact
-they take for 0.1 ms; a tone was taken for 0.8 ms; on a car's posts a delay that all channels of one
-corner have in common was estimated with errors of 0.6 ms."""
+LEAST_WIDTH_S = 1e-3
+"""Least time for which that is, and least delay that counts where no model explains the data: the
+functions of the estimate bend less than a stop, whose contact they take for 0.1 ms; a tone was
+taken for 0.8 ms, a damper that warms up for 0.5 ms; on a car's posts a delay that all channels of
+one corner have in common was estimated with errors of 0.6 ms."""
 _VAGUE_S = 0.2e-3
 """Standard deviation from which on an estimate is vague: friction that weakens with speed was taken
 for a delay of 3.3 ms, with one of 0.27; delays that are there are known to some microseconds."""
@@ -70,12 +71,12 @@ def _about(parameter: LinearParameter, delay_s: float, std_s: float) -> LinearPa
     four deviations of the prior.
     """
     expected_s = delay_s if abs(delay_s) > SIGNIFICANT * std_s else 0.0
-    width_s = max(_WIDTH * std_s, _LEAST_WIDTH_S)
+    width_s = max(_WIDTH * std_s, LEAST_WIDTH_S)
     least, most = expected_s - width_s, expected_s + width_s
     if std_s > _VAGUE_S:
         farthest_s = SIGNIFICANT * parameter.deviation
-        least = max(min(least, -_LEAST_WIDTH_S), min(expected_s, 0.0) - farthest_s)
-        most = min(max(most, _LEAST_WIDTH_S), max(expected_s, 0.0) + farthest_s)
+        least = max(min(least, -LEAST_WIDTH_S), min(expected_s, 0.0) - farthest_s)
+        most = min(max(most, LEAST_WIDTH_S), max(expected_s, 0.0) + farthest_s)
     return parameter._replace(expected=expected_s, least=least, most=most)
 
 

@@ -44,6 +44,9 @@ _REST_AFTER_TURN = 0.6
 _ALIKE = 2
 """Combinations of the same families that are fitted: of several formulas for one effect the second
 best by a regression may be the best in simulation."""
+_TIE = 1.05
+"""Times the cost that the best change promises, up to which others of the same families are fitted:
+a linearisation is not better than that."""
 _SELDOM = 0.01
 """Share of the time in which a strut has to pull for a contact to be lost in it."""
 
@@ -164,7 +167,7 @@ def _try_formulas(pool: Pool) -> None:
     """
     for _ in range(pool.criteria.most_laws):
         best = pool.converge_least()
-        is_near = best.cost < pool.criteria.hopeless * pool.highest_at_floor(best)
+        is_near = best.cost < pool.criteria.settled**2 * pool.highest_at_floor(best)
         if not (best.size and is_near) or pool.at_floor(best):
             return
         laws = best.fit.candidate.new
@@ -279,13 +282,25 @@ def _promising(
 ) -> list[ModelChange]:
     """The best changes of a model that add a law, and those that exchange each of its laws.
 
-    Two like laws of each are fitted: a damper's formula is not to be left because a better one for
-    its friction comes first.
+    Two like laws of each are fitted, and what promises as much as the best one: a damper's formula
+    is not to be left because a better one for its friction comes first.
     """
-    chosen = _diverse([change for change in changes if set(laws) <= set(change.laws)], count)
+    additions = [change for change in changes if set(laws) <= set(change.laws)]
+    chosen = _diverse(additions, count)
+    known = {change.laws for change in chosen}
+    chosen += [it for it in additions if it.laws not in known and _ties(it, chosen[0])]
     for law in laws:
         chosen += [change for change in changes if law not in change.laws][:_ALIKE]
     return chosen
+
+
+def _ties(change: ModelChange, best: ModelChange) -> bool:
+    """Whether a change promises as much as the best one, with laws of the same families."""
+    return change.cost < _TIE * best.cost and _families(change) == _families(best)
+
+
+def _families(change: ModelChange) -> tuple[str, ...]:
+    return tuple(sorted(effect(name).family for _, name in change.laws))
 
 
 def _screen_rounds(

@@ -478,15 +478,16 @@ def is_compatible(at: StrutEffect, laws: Sequence[StrutEffect]) -> bool:
     if item.family not in _REPEATABLE:
         return not alike
     # A damper has one force over velocity; what acts in a part of the stroke may be added to it.
-    curves = sum(_reads_velocity_alone(it.name) for it in (item, *alike))
+    curves = sum(reads_alone(it.name, "velocity_m_per_s") for it in (item, *alike))
     return item not in alike and curves < 2
 
 
 @cache
-def _reads_velocity_alone(name: str) -> bool:
+def reads_alone(name: str, quantity: str) -> bool:
+    """Whether a law's force is a function of one quantity of the motion alone."""
     item = effect(name)
     read = {it.name for it in arguments(item.force, item) if it.origin in ("motion", "states")}
-    return read == {"velocity_m_per_s"}
+    return read == {quantity}
 
 
 @np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.
