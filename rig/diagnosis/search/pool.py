@@ -250,8 +250,9 @@ class Pool:
     def _fit_from(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
         """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
 
-        `least` is the sum of squares of the best model before. None, too, where a fit began there
-        before: its result is known.
+        One that is not near its promise even where it is held the most is not let go: free it would
+        be farther off. `least` is the sum of squares of the best model before. None, too, where a
+        fit began there before: its result is known.
         """
         key = begin.key, effort
         if key in self.begun:
@@ -266,6 +267,8 @@ class Pool:
             return result
         for problem in self.held:
             held = self._refit(problem, begin, effort)
+            if held is not None and held.mean_square > _MISSED * begin.promised:
+                return result
             begin = begin if held is None else begin._replace(model=held.model)
         other = self._refit(self.problem, begin, effort)
         if other is None or (result is not None and result.mean_square < other.mean_square):
