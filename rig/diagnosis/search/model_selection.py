@@ -509,17 +509,30 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
 
 
 def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
-    """A model with those of its linear corrections alone that differ from zero."""
-    candidate, parts = chosen.fit.model
-    significant = _significant_parameters(chosen.fit, pool.criteria.significant)
+    """A model with those of its linear corrections alone that differ from zero.
+
+    They are looked at again once others are gone: what offset these may then be zero itself.
+    """
+    significant = _significant_corrections(pool, chosen.fit)
+    while True:
+        candidate, parts = chosen.fit.model
+        parts = parts._replace(linear=np.where(significant, parts.linear, 0.0))
+        fewer = fit(pool.problem, CandidateModel(candidate, parts), significant, FINAL)
+        if fewer is None or pool.prefers(chosen, lean := pool.validate(fewer)):
+            return chosen
+        significant = _significant_corrections(pool, fewer)
+        if np.array_equal(significant, fewer.free):
+            return lean
+        chosen = lean
+
+
+def _significant_corrections(pool: Pool, result: Fit) -> Flags:
+    """Which of a fit's linear parameters a model keeps, shape (L,)."""
+    significant = _significant_parameters(result, pool.criteria.significant)
     # Where the data do not show a delay, spring and damper are known no better than it.
     for i, p in enumerate(pool.problem.linear):
         significant[i] |= is_undetermined(p) and bool(_springs_and_dampers(pool, significant))
-    parts = parts._replace(linear=np.where(significant, parts.linear, 0.0))
-    fewer = fit(pool.problem, CandidateModel(candidate, parts), significant, FINAL)
-    if fewer is not None and not pool.prefers(chosen, lean := pool.validate(fewer)):
-        return lean
-    return chosen
+    return significant
 
 
 def _with_other_corrections(pool: Pool, full: Fit, lean: Fit) -> tuple[Fit, ...]:

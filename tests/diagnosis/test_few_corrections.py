@@ -1,0 +1,42 @@
+"""Which linear corrections a model keeps."""
+
+import numpy as np
+
+from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.problem.build import build
+from rig.diagnosis.search import model_selection
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.pool import Pool
+from tests.diagnosis import little_bench as bench
+
+SHARE = 1.1
+"""Damping of the bench over that of the model file."""
+
+
+def corrections(monkeypatch, *, first):
+    """Kinds of the corrections that stay, where a first look keeps those of some kinds."""
+    record = bench.run(bench.Nothing(), noise_m=1e-5, duration_s=8.0)
+    model = bench.model(damping=bench.DAMPING / SHARE)
+    problem = build(model, [record], 32, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    looked_at, significant = [], model_selection._significant_parameters
+
+    def look(result, deviations):
+        found = significant(result, deviations)
+        if not looked_at:
+            found = found | np.array([p.kind in first for p in problem.linear])
+        looked_at.append(result)
+        return found
+
+    monkeypatch.setattr(model_selection, "_significant_parameters", look)
+    kept = model_selection._with_significant_corrections(pool, pool.linear)
+    return {p.kind for p, free in zip(problem.linear, kept.fit.free, strict=True) if free}
+
+
+def test_corrections_that_differ_from_zero_stay_alone(monkeypatch):
+    assert corrections(monkeypatch, first=()) == {"damping"}
+
+
+def test_a_correction_that_is_zero_once_others_are_gone_goes_too(monkeypatch):
+    assert corrections(monkeypatch, first=("mass", "stiffness")) == {"damping"}
