@@ -19,6 +19,8 @@ from rig.diagnosis.search.fit import Fit
 from rig.diagnosis.search.model_selection import SearchResult
 from rig.diagnosis.search.screen import reads_alone
 
+_CURVES = ("nonlinear_stiffness", "stop", "backlash")
+"""Families whose laws shape the curve of a strut's force over its height."""
 HeldOutLaws = Mapping[StrutEffect, HeldOutLaw]
 """What held-out data say of each law of the chosen model."""
 
@@ -38,6 +40,9 @@ def confirmations(
 ) -> dict[StrutEffect, Confirmation]:
     """What held-out data show of each law of the chosen model.
 
+    Where the model does not explain, springs, stops and play of a strut are one curve over its
+    height: of these the one that the data need most is confirmed.
+
     Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
     it whatever it is: at most the one that the data need most is confirmed. What is left may be due
     to its formula then, so that its family has to have others: a periodic force has none. Two laws
@@ -46,17 +51,32 @@ def confirmations(
     found: dict[StrutEffect, Confirmation] = {
         law: confirmation(it, criteria) for law, it in laws.items()
     }
-    if quadratic_mean(_over_floor(evaluations)) <= criteria.settled:
+    ratio = quadratic_mean(_over_floor(evaluations))
+    if ratio <= criteria.explained:
         return found
-    settled: set[StrutEffect] = set()
-    if search.evidence and _share_left(evaluations, criteria) < criteria.leading:
-        gains = {law: it.without.log_likelihood for law, it in search.evidence.items()}
-        leading = max(gains, key=gains.__getitem__)
-        if _has_other_formulas(leading[1]) and not _is_part_of_curve(leading, gains):
-            settled.add(leading)
+    gains = {law: it.without.log_likelihood for law, it in search.evidence.items()}
+    by_need = sorted(gains, key=gains.__getitem__, reverse=True)
+    if ratio <= criteria.settled:
+        settled = set(found) - _further_curves(by_need)
+    elif by_need and _share_left(evaluations, criteria) < criteria.leading:
+        settled = {law for law in by_need[:1] if _may_be_named_alone(law, by_need)}
+    else:
+        settled = set[StrutEffect]()
     for law in {law for law, it in found.items() if it == "confirmed"} - settled:
         found[law] = "unsettled"
     return found
+
+
+def _further_curves(by_need: Sequence[StrutEffect]) -> set[StrutEffect]:
+    """Springs, stops and play of struts that have one which the data need more."""
+    curves = [law for law in by_need if effect(law[1]).family in _CURVES]
+    struts = [strut for strut, _ in curves]
+    return {law for i, law in enumerate(curves) if law[0] in struts[:i]}
+
+
+def _may_be_named_alone(law: StrutEffect, laws: Sequence[StrutEffect]) -> bool:
+    """Whether what a law leaves may be due to its formula, and it is no part of a curve."""
+    return _has_other_formulas(law[1]) and not _is_part_of_curve(law, laws)
 
 
 def _has_other_formulas(name: str) -> bool:

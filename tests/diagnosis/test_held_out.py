@@ -112,7 +112,13 @@ def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW)):
 
 
 def test_near_the_floor_all_that_held_out_data_confirm_are_named():
-    assert shown(4.5 * FLOOR_M) == ["confirmed"] * 3
+    assert shown(4.5 * FLOOR_M, laws=(OTHER, LAW, (0, "maxwell"))) == ["confirmed"] * 3
+
+
+def test_where_a_model_does_not_explain_one_of_the_laws_of_a_curve_is_named():
+    assert shown(1.1 * FLOOR_M) == ["confirmed"] * 3
+    assert shown(1.4 * FLOOR_M) == ["confirmed", "unsettled", "confirmed"]
+    assert shown(1.4 * FLOOR_M, laws=(OTHER, (1, "end_stops"))) == ["confirmed"] * 2
 
 
 def test_far_above_the_floor_only_the_law_that_data_need_most_is_named():
@@ -130,7 +136,7 @@ def test_far_above_the_floor_parts_of_one_curve_are_not_named():
     assert shown(40.0 * FLOOR_M, laws=(spring, OTHER)) == ["unsettled"] * 2
     assert shown(40.0 * FLOOR_M, laws=(spring, (1, "backlash"))) == ["confirmed", "unsettled"]
     assert shown(40.0 * FLOOR_M, laws=(LAW, spring, OTHER))[0] == "confirmed"
-    assert shown(4.5 * FLOOR_M, laws=(spring, OTHER)) == ["confirmed"] * 2
+    assert shown(4.5 * FLOOR_M, laws=(spring, OTHER)) == ["confirmed", "unsettled"]
 
 
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
