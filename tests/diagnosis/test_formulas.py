@@ -67,3 +67,11 @@ def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():
     changes = [change(cost, name) for name, cost in promised.items()]
     fitted = {it.laws[1][1] for it in _promising(changes, [friction], 4)}
     assert fitted == set(promised) - {"zone_damping"}
+
+
+def test_what_promises_as_much_as_the_best_exchange_is_fitted_too():
+    play, spring = (0, "backlash"), (0, "power_stiffness")
+    names = ("cubic_stiffness", "quadratic_stiffness", "exponential_stiffness")
+    alike = [SimpleNamespace(cost=100.0, laws=(play, (0, name))) for name in names]
+    worse = SimpleNamespace(cost=106.0, laws=(play, (0, "progressive_stiffness")))
+    assert _promising([*alike, worse], [play, spring], 4) == alike

@@ -290,7 +290,8 @@ def _promising(
     known = {change.laws for change in chosen}
     chosen += [it for it in additions if it.laws not in known and _ties(it, chosen[0])]
     for law in laws:
-        chosen += [change for change in changes if law not in change.laws][:_ALIKE]
+        others = [change for change in changes if law not in change.laws]
+        chosen += [it for i, it in enumerate(others) if i < _ALIKE or _ties(it, others[0])]
     return chosen
 
 
