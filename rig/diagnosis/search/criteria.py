@@ -82,7 +82,7 @@ class SelectionCriteria:
         explained: Multiple of the noise floor that a right model does not exceed on held-out data:
             the scatter of an RMS over some hundred independent samples.
         settled: Multiple of the noise floor up to which a set may owe what it leaves to a formula:
-            on held-out data all names are believed, and in the search every other formula is tried.
+            on held-out data further names are believed, and in the search other formulas are tried.
             Beyond it a further law may stand in for what the formula of another lacks: of partial
             explanations by several laws in the method's development, right ones left 3.4 times the
             floor at most, and those with a false further name 6 times and more, but for one.
