@@ -18,9 +18,8 @@ from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import Fit
 from rig.diagnosis.search.model_selection import SearchResult
 from rig.diagnosis.search.screen import reads_alone
+from rig.diagnosis.search.validity import OVER_HEIGHT
 
-_CURVES = ("nonlinear_stiffness", "stop", "backlash")
-"""Families whose laws shape the curve of a strut's force over its height."""
 HeldOutLaws = Mapping[StrutEffect, HeldOutLaw]
 """What held-out data say of each law of the chosen model."""
 
@@ -69,7 +68,7 @@ def confirmations(
 
 def _further_curves(by_need: Sequence[StrutEffect]) -> set[StrutEffect]:
     """Springs, stops and play of struts that have one which the data need more."""
-    curves = [law for law in by_need if effect(law[1]).family in _CURVES]
+    curves = [law for law in by_need if effect(law[1]).family in OVER_HEIGHT]
     struts = [strut for strut, _ in curves]
     return {law for i, law in enumerate(curves) if law[0] in struts[:i]}
 

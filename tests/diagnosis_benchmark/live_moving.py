@@ -1,7 +1,7 @@
 """A corrected model of a bench whose base is moved, live: in lockstep with that bench over CAN.
 
-The run is that of `rig run` with the configuration of the package: its observers are those of a
-Kalman filter, whose gains are computed from the model that they observe.
+The run is that of `rig run` with the configuration of the package: its observers are Kalman
+filters, whose gains are computed from the model.
 """
 
 import math
@@ -39,7 +39,7 @@ _FLOOR_SEED = 1
 def live_force_of_moving(case: MovingCase, corrected: ModelSpec) -> float:
     """RMS virtual force of a corrected model on its bench, over that of a right model.
 
-    The bench moves as it did not for the diagnosis. The floor is what the same observers find of
+    The bench moves as in the held-out run. The floor is what the same observers find of
     the bench without any effect, with the model that lacks nothing: it is made by noise, and by
     holding values from tick to tick. Infinite where a force is not finite.
     """
@@ -54,7 +54,7 @@ def _floor_n(kind: str) -> float:
 
 
 def _virtual_force_n(kind: str, bench: BenchConfig, model: ModelSpec) -> float:
-    """RMS of the virtual forces of all observed struts."""
+    """RMS of the virtual forces of all struts; they are zero without an observer."""
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         (folder / "model.yaml").write_text(dump_model(model), encoding="utf-8")

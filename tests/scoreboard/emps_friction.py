@@ -30,14 +30,14 @@ FRICTIONS_N = (18.0, 19.0, 20.0, PUBLISHED_N, 21.0, 22.0, 23.0, 24.0)
 _NAME = "EMPS, friction held, all else fitted to the recording itself"
 _UNIT = "RMSE of the position in free-run simulation, mm"
 _SOURCE = "computed here; independent of the diagnosis"
-_START = (95.1, 203.5, 203.5, 3.16, 0.0, 0.0)
+_START = np.array([95.1, 203.5, 203.5, 3.16, 0.0, 0.0])
 """Mass in kg, damping of either direction in N·s/m, and constant force in N, as published; start
 position in mm from the first sample, start velocity in mm/s."""
-_SCALES = np.array([95.1, 203.5, 203.5, 3.16, 1.0, 1.0])
+_SCALES = np.where(_START, _START, 1.0)
 _STEPS = 4
 """Steps of the simulation a sample; with twice as many the errors move by less than 0.01 mm."""
 _EVERY = 5
-"""Every fifth sample counts: the position moves by far less than a millimetre between them."""
+"""Every fifth sample counts: the error changes by some 0.1 mm at most from one to the next."""
 _MM_PER_M = 1000.0
 
 
@@ -93,7 +93,7 @@ def profile(record: Recording, frictions_n: Sequence[float] = FRICTIONS_N) -> Ar
     """Least error in mm at each friction; each is fitted from either neighbour's parameters."""
     errors_mm = np.full(len(frictions_n), np.inf)
     for order in (range(len(frictions_n)), range(len(frictions_n) - 1, -1, -1)):
-        at = np.array(_START)
+        at = _START
         for i in order:
             error_mm, at = _fit(record, frictions_n[i], at)
             errors_mm[i] = min(errors_mm[i], error_mm)

@@ -297,11 +297,11 @@ def _promising(
 
 def _ties(change: ModelChange, best: ModelChange) -> bool:
     """Whether a change promises as much as the best one, with laws of the same families."""
-    return change.cost < _TIE * best.cost and _families(change) == _families(best)
+    return change.cost < _TIE * best.cost and _families(change.laws) == _families(best.laws)
 
 
-def _families(change: ModelChange) -> tuple[str, ...]:
-    return tuple(sorted(effect(name).family for _, name in change.laws))
+def _families(laws: Sequence[StrutEffect]) -> tuple[str, ...]:
+    return tuple(sorted(effect(name).family for _, name in laws))
 
 
 def _screen_rounds(
@@ -389,7 +389,7 @@ def _diverse(level: Sequence[LawCombination], count: int) -> list[LawCombination
     for screening in level:
         if len(chosen) >= count:
             break
-        families = tuple(sorted(effect(name).family for _, name in screening.laws))
+        families = _families(screening.laws)
         if counts.get(families, 0) < _ALIKE:
             chosen.append(screening)
             counts[families] = counts.get(families, 0) + 1

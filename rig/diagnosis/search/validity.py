@@ -43,9 +43,11 @@ _VELOCITIES = 8
 """Velocities beyond the recorded ones at which power is evaluated."""
 _TINY = 1e-100
 """Least divisor."""
+OVER_HEIGHT = ("nonlinear_stiffness", "stop", "backlash")
+"""Families whose laws shape the curve of a strut's force over its height."""
 _REPLACED = {
     "mass": (),
-    "stiffness": ("nonlinear_stiffness", "stop", "backlash"),
+    "stiffness": OVER_HEIGHT,
     "damping": ("nonlinear_damping", "friction", "fade"),
 }
 """Linear parameters whose priors rule laws out, and the families that may replace each."""
