@@ -68,8 +68,12 @@ class EquationsOfMotion(Generic[Value]):
         for index, (strut, _, _, push) in enumerate(struts):
             height_m, velocity_m_per_s = state.struts[index]
             force = strut.force_n(
-                height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
+                height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c
             )
+            if internal:
+                strut.write_rates(
+                    height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
+                )
             forces.append(force)
             total = total + (force + virtual_forces_n[index]) * push
         acceleration = backend.acceleration(q, v, total)
@@ -132,8 +136,13 @@ class EquationsOfMotion(Generic[Value]):
             for index, (strut, offset_m, row, push) in enumerate(struts):
                 height_m, velocity_m_per_s = offset_m + dot(row, q), dot(row, v)
                 force = strut.force_n(
-                    height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
+                    height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c
                 )
+                if internal:
+                    strut.write_rates(
+                        height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c,
+                        rates,
+                    )  # fmt: skip
                 total = total + (force + virtual_forces_n[index]) * push
             return acceleration(q, v, total), rates
 

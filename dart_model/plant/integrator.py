@@ -80,7 +80,7 @@ def advance(
         a3, rates3 = slope(
             move(q, v + h * a1, h),
             v + h * (2.0 * a2 - a1),
-            propagate(propagate(internal, 2.0 * h, rates2), -h, rates1) if internal else internal,
+            _extrapolate(internal, h, rates1, rates2) if internal else internal,
             t_s,
             step / steps,
         )
@@ -88,11 +88,7 @@ def advance(
         q = move(q, v + sixth * (a1 + 2.0 * a2), h)
         v = v + sixth * (a1 + 4.0 * a2 + a3)
         if internal:
-            mean = [
-                (begin + 4.0 * middle + after) / 6.0
-                for begin, middle, after in zip(rates1, rates2, rates3, strict=True)
-            ]
-            internal = propagate(internal, h, mean)
+            internal = _weigh(internal, h, rates1, rates2, rates3)
         if step < steps:
             a1, rates1 = slope(q, v, internal, t_s, step / steps)
     return q, v, internal
@@ -101,6 +97,26 @@ def advance(
 def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
     """Internal states after a duration (s) at constant rates."""
     return tuple([state + h * rate for state, rate in zip(internal, rates, strict=True)])
+
+
+def _extrapolate(
+    internal: Internal, h: float, begin: Sequence[float], middle: Sequence[float]
+) -> Internal:
+    """Internal states of the last stage, by the rates of the first two."""
+    states = zip(internal, begin, middle, strict=True)
+    return tuple([state + 2.0 * h * rate2 - h * rate1 for state, rate1, rate2 in states])
+
+
+def _weigh(
+    internal: Internal,
+    h: float,
+    begin: Sequence[float],
+    middle: Sequence[float],
+    after: Sequence[float],
+) -> Internal:
+    """Internal states at the end of a step, by the rates of its stages."""
+    states = zip(internal, begin, middle, after, strict=True)
+    return tuple([state + h * ((r1 + 4.0 * r2 + r3) / 6.0) for state, r1, r2, r3 in states])
 
 
 class Linearised(NamedTuple):

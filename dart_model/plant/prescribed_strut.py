@@ -65,9 +65,8 @@ class PrescribedStrut:
         self, state: PrescribedState, height_m: float, velocity_m_per_s: float, temperature_c: float
     ) -> float:
         """Force of spring, damper and effects: what a load cell would show."""
-        unused = [0.0] * self._strut.states
         return self._strut.force_n(
-            height_m, velocity_m_per_s, state.internal, state.t_s, 0.0, temperature_c, unused
+            height_m, velocity_m_per_s, state.internal, state.t_s, 0.0, temperature_c
         )
 
     def _rates(
@@ -75,5 +74,7 @@ class PrescribedStrut:
     ) -> list[float]:
         height_m, velocity_m_per_s = motion(t_s)
         rates = [0.0] * self._strut.states
-        self._strut.force_n(height_m, velocity_m_per_s, internal, t_s, 0.0, temperature_c, rates)
+        self._strut.write_rates(
+            height_m, velocity_m_per_s, internal, t_s, 0.0, temperature_c, rates
+        )
         return rates

@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from dart_model.effects import AMBIENT_C, effect
 from dart_model.effects.calling import (
+    MOTION,
     ForceOverArrays,
     RatesOverArrays,
+    arguments,
     force_over_arrays,
     rates_over_arrays,
 )
@@ -64,6 +66,7 @@ class _Part(NamedTuple):
         name: What it is called in messages.
         first: Index of its first internal state in the model's.
         end: Index after its last one.
+        reads: What it reads, by the names of `dart_model.effects.calling`.
     """
 
     name: str
@@ -72,6 +75,7 @@ class _Part(NamedTuple):
     parameters: Sequence[float]
     first: int
     end: int
+    reads: Collection[str]
 
 
 class Strut:
@@ -95,16 +99,20 @@ class Strut:
             law = effect(item.name)
             end = first + law.state_size
             force, rates = force_over_arrays(law), rates_over_arrays(law)
-            parts.append(_Part(law.name, force, rates, item.values(), first, end))
+            reads = {argument.name for argument in arguments(law.force, law)}
+            parts.append(_Part(law.name, force, rates, item.values(), first, end, reads))
             first = end
         self.mockup: MockUp | None = None
         """FMU that gives a part of its force; its states are the strut's last."""
         if spec.fmu is not None:
             unit = self.mockup = MockUp(spec.fmu, folder, gravity_m_per_s2)
             end = first + len(unit.state_scales)
-            parts.append(_Part(unit.name, unit.force, unit.rate, (), first, end))
+            parts.append(_Part(unit.name, unit.force, unit.rate, (), first, end, MOTION))
             first = end
         self._parts = tuple(parts)
+        self._remembering = tuple(part for part in parts if part.end > part.first)
+        self._over_height = tuple(part for part in parts if "height_m" in part.reads)
+        self._over_velocity = tuple(part for part in parts if "velocity_m_per_s" in part.reads)
         self.states = first - first_state
         """Number of internal states."""
 
@@ -116,7 +124,6 @@ class Strut:
         t_s: float,
         applied_force_n: float,
         temperature_c: float,
-        internal_rates: list[float],
     ) -> float:
         """Force, positive when it pushes the two bodies apart.
 
@@ -127,23 +134,35 @@ class Strut:
             t_s: Time, for effects that depend on it.
             applied_force_n: Applied force, for effects that act on it.
             temperature_c: Damper temperature.
-            internal_rates: Derivative of `internal`; this strut's part is written.
         """
         force = self._stiffness * (self._free_length - height_m) - self._damping * velocity_m_per_s
         strut = self._constants
-        for _, part_n, part_rates, values, first, end in self._parts:
-            own = internal[first:end]
+        for _, part_n, _, values, first, end, _ in self._parts:
             force += part_n(
-                t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own, values, strut
-            )
-            if own:
-                rates = [0.0] * len(own)
-                part_rates(
-                    t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own, values,
-                    strut, rates,
-                )  # fmt: skip
-                internal_rates[first:end] = rates
+                t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c,
+                internal[first:end], values, strut,
+            )  # fmt: skip
         return force
+
+    def write_rates(
+        self,
+        height_m: float,
+        velocity_m_per_s: float,
+        internal: Sequence[float],
+        t_s: float,
+        applied_force_n: float,
+        temperature_c: float,
+        internal_rates: list[float],
+    ) -> None:
+        """Write this strut's part of the derivative of `internal`; arguments as of `force_n`."""
+        strut = self._constants
+        for _, _, part_rates, values, first, end, _ in self._remembering:
+            rates = [0.0] * (end - first)
+            part_rates(
+                t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c,
+                internal[first:end], values, strut, rates,
+            )  # fmt: skip
+            internal_rates[first:end] = rates
 
     @property
     def is_linear(self) -> bool:
@@ -164,14 +183,20 @@ class Strut:
         They are secants, which smooth what is steeper than a control loop can use: the sign of dry
         friction, the edge of a stop.
         """
-        others = internal, t_s, applied_force_n, temperature_c, list(internal)
         low_m, high_m = height_m - _SECANT_M, height_m + _SECANT_M
         slow, fast = velocity_m_per_s - _SECANT_M_PER_S, velocity_m_per_s + _SECANT_M_PER_S
-        by_height = self.force_n(low_m, velocity_m_per_s, *others) - self.force_n(
-            high_m, velocity_m_per_s, *others
-        )
-        by_velocity = self.force_n(height_m, slow, *others) - self.force_n(height_m, fast, *others)
-        return by_height / (2.0 * _SECANT_M), by_velocity / (2.0 * _SECANT_M_PER_S)
+        stiffness, damping, strut = self._stiffness, self._damping, self._constants
+        for _, part_n, _, values, first, end, _ in self._over_height:
+            others = (
+                velocity_m_per_s, applied_force_n, temperature_c, internal[first:end], values, strut
+            )  # fmt: skip
+            fall = part_n(t_s, low_m, *others) - part_n(t_s, high_m, *others)
+            stiffness += fall / (2.0 * _SECANT_M)
+        for _, part_n, _, values, first, end, _ in self._over_velocity:
+            others = applied_force_n, temperature_c, internal[first:end], values, strut
+            fall = part_n(t_s, height_m, slow, *others) - part_n(t_s, height_m, fast, *others)
+            damping += fall / (2.0 * _SECANT_M_PER_S)
+        return stiffness, damping
 
     def slope_tables(self) -> tuple[SlopeTable, SlopeTable]:
         """Stiffness (N/m) over height and damping (N·s/m) over velocity, with effects.
@@ -193,11 +218,10 @@ class Strut:
         internal = [0.0] * self._parts[-1].end
         try:
             by_height = [
-                self.force_n(x, 0.0, internal, 0.0, 0.0, AMBIENT_C, internal.copy())
-                for x in heights.tolist()
+                self.force_n(x, 0.0, internal, 0.0, 0.0, AMBIENT_C) for x in heights.tolist()
             ]
             by_velocity = [
-                self.force_n(self._free_length, v, internal, 0.0, 0.0, AMBIENT_C, internal.copy())
+                self.force_n(self._free_length, v, internal, 0.0, 0.0, AMBIENT_C)
                 for v in velocities.tolist()
             ]
         except (ArithmeticError, ValueError) as error:

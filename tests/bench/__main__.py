@@ -17,6 +17,7 @@ from tests.bench.test_many_struts import OBSERVERS, STANDING, strut_subjects
 from tests.bench.test_tick_speed import (
     ROUNDS,
     TICKS,
+    corrected_subjects,
     observer_subjects,
     ratios,
     tick_subjects,
@@ -67,6 +68,16 @@ def _spread(low: float, middle: float, high: float) -> str:
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"
 
 
+def compare_models() -> str:
+    """Table of corrected models against the nominal one."""
+    found = time_rounds(corrected_subjects())
+    over = ratios(found, next(iter(found)))
+    rows = [
+        (name, f"{np.median(times):.1f}", _spread(*over[name])) for name, times in found.items()
+    ]
+    return table(("one tick", "median, µs", "ratio to the nominal model"), rows)
+
+
 def compare_struts(folder: Path) -> str:
     """Table of four struts of a full car against one."""
     with patch.object(build, "ENGINES", STANDING):
@@ -104,6 +115,8 @@ def main() -> None:
             compare(time_rounds(tick_subjects())),
             "The bare DART loops with a PI observer added, and nothing else:",
             compare(time_rounds(observer_subjects())),
+            "Whole ticks with models to which a diagnosis has added a law:",
+            compare_models(),
             "Whole ticks with four struts of a full car, compared with one strut. The model is "
             "replaced by one that computes nothing: the times are those of the bridge alone, and "
             "are not comparable with those above:",

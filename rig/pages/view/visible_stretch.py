@@ -320,7 +320,7 @@ def _line(
     temperature_c: float,
 ) -> list[list[float]]:
     force = [
-        law.force_n(float(h), float(v), rest, 0.0, 0.0, temperature_c, list(rest))
+        law.force_n(float(h), float(v), rest, 0.0, 0.0, temperature_c)
         for h, v in zip(heights, velocities, strict=True)
     ]
     return [_numbers(along), _numbers(np.array(force))]
