@@ -87,6 +87,7 @@ BACKLASH = Effect(
     bounds=_BOUNDS,
     simpler=("free_play", "linear_stiffness"),
     shown=("gap_m",),
+    edges=((0.0, -0.5, 1.0), (0.0, 0.5, 1.0)),
 )
 
 FREE_PLAY = Effect(
@@ -101,6 +102,7 @@ FREE_PLAY = Effect(
     starts=_free_play_starts,
     bounds=_BOUNDS,
     shown=("gap_m",),
+    edges=((1.0, -0.5), (1.0, 0.5)),
 )
 
 LIFT_OFF = Effect(

@@ -149,6 +149,8 @@ class Effect:
         simpler: Effects to which this one degenerates at the ends of its parameters.
         benches: Kinds of bench on which it can be seen.
         shown: Parameters that a sentence about it states.
+        edges: Of a law that changes at two heights, the lower and the upper one, each by the
+            weights of all parameters in it; empty for others.
         about_free_length: Whether another free length changes its force by more than a linear
             spring and damper could.
     """
@@ -171,6 +173,7 @@ class Effect:
     simpler: tuple[str, ...] = ()
     benches: tuple[Bench, ...] = ("force_given", "motion_given")
     shown: tuple[str, ...] = ()
+    edges: tuple[tuple[float, ...], ...] = ()
     about_free_length: bool = False
 
     @property

@@ -204,6 +204,7 @@ _HIGH_END = height(0.7, 1.02)
 
 _LOW = Parameter("low_contact_height_m", "m", -1e4, 1e4, "height of the bump stop")
 _HIGH = Parameter("high_contact_height_m", "m", -1e4, 1e4, "height of the rebound stop")
+_EDGES = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0))
 
 _LINEAR = (
     _CONTACT,
@@ -324,6 +325,7 @@ END_STOPS = _stop(
     bounds=within(low_contact_height_m=_LOW_END, high_contact_height_m=_HIGH_END),
     simpler=("bump_stop", "rebound_stop"),
     shown=("low_contact_height_m", "high_contact_height_m", "stiffness_n_per_m"),
+    edges=_EDGES,
 )
 
 HERTZ_END_STOPS = _stop(
@@ -342,4 +344,5 @@ HERTZ_END_STOPS = _stop(
     ),
     simpler=("hertz_bump_stop", "hertz_rebound_stop"),
     shown=("low_contact_height_m", "high_contact_height_m"),
+    edges=_EDGES,
 )

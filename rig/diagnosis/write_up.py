@@ -13,6 +13,12 @@ from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.diagnosis.acting_range import find_acting_range
 from rig.diagnosis.damper_forces import damper_forces
 from rig.diagnosis.free_length import notes_of_springs
+from rig.diagnosis.open_edges import (
+    UnreachedEdge,
+    find_unreached_edges,
+    open_parameters,
+    open_preload,
+)
 from rig.diagnosis.outcome import (
     IMPROBABLE,
     ChannelCorrection,
@@ -32,6 +38,7 @@ from rig.diagnosis.outcome import (
 )
 from rig.diagnosis.problem.channel_delays import SIGNIFICANT, is_undetermined
 from rig.diagnosis.problem.delay_estimate import LEAST_WIDTH_S
+from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
@@ -57,6 +64,7 @@ from rig.diagnosis.search.fit import (
     effect_variables,
     fit_covariance,
     is_white,
+    law_values,
     spread_over,
 )
 from rig.diagnosis.search.model_selection import SearchResult
@@ -133,6 +141,20 @@ class FitEstimates(NamedTuple):
             value + nominal, max(value - half, low) + nominal, min(value + half, high) + nominal
         )
 
+    def half_of(self, variables: NDArray[np.intp], weights: Sequence[Sequence[float]]) -> Array:
+        """Half-widths of the intervals of sums of parameters, shape (n,).
+
+        Args:
+            variables: Search variables of the parameters, shape (k,).
+            weights: Of the parameters in each sum, shape (n, k).
+        """
+        space, values = self.fit.space, self.fit.solution.values
+        units = np.where(space.logarithmic, values, space.scale)[variables]
+        rows = np.array(weights) * units
+        covariance = self.covariance.covariance[np.ix_(variables, variables)]
+        variances = np.einsum("ij,jk,ik->i", rows, covariance, rows)
+        return np.asarray(self.covariance.factor * np.sqrt(np.maximum(variances, 0.0)))
+
 
 def compose_result(
     problem: Problem,
@@ -152,6 +174,8 @@ def compose_result(
     covariance = fit_covariance(chosen).wider_by(spread_over(problem, chosen, search.alike))
     estimates = FitEstimates(chosen, covariance)
     corrected = spec_with_corrections(problem, chosen.model)
+    found = _find_laws(problem, estimates, after, criteria)
+    tracks = [forces.track for forces in after if forces is not None]
     held_out = _held_out(evaluations, by_blocks=by_blocks)
     others = _other_families(search) if verdict in ("ambiguous", "partly_explained") else ()
     is_explained = verdict in ("explained", "ambiguous")
@@ -159,8 +183,8 @@ def compose_result(
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
         verdict,
-        linear_corrections(problem, estimates),
-        _effects(problem, estimates, after, _evidence(search, evaluations, laws, criteria))
+        _open_preloads(problem, linear_corrections(problem, estimates), found),
+        _effects(problem, found, tracks, _evidence(search, evaluations, laws, criteria))
         + _linear_effects(problem, estimates, after, channels),
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
@@ -175,11 +199,12 @@ def compose_result(
             is_white(problem, search.given, criteria.white),
             is_white(problem, chosen, criteria.white),
         ),
-        _notes(problem, search, by_blocks=by_blocks)
+        _notes(problem, search, found, by_blocks=by_blocks)
         + _notes_of_zero_and_gain(problem, estimates)
         + notes_of_springs(problem, chosen, estimates.covariance, corrected.struts)
         + _notes_of_channels(channels)
         + _notes_of_bounds(problem, estimates)
+        + _notes_of_edges(problem, found)
         + _notes_of_friction_like_laws(problem, chosen, after)
         + _notes_of_standstill(problem, after)
         + notes_of_opposite_errors(held_out),
@@ -297,26 +322,77 @@ def _evidence(
     }
 
 
-def _effects(
+class _LawFound(NamedTuple):
+    """A chosen law along the recordings.
+
+    Attributes:
+        force_n: Its force.
+        residual_n: What is left in its strut; NaN where it is not known.
+        unreached: Its edges that the motion did not reach.
+    """
+
+    strut: int
+    name: str
+    force_n: Array
+    residual_n: Array
+    parameters: dict[str, Estimate]
+    unreached: tuple[UnreachedEdge, ...]
+
+
+def _find_laws(
     problem: Problem,
     estimates: FitEstimates,
     after: Sequence[ResidualForces | None],
+    criteria: SelectionCriteria,
+) -> list[_LawFound]:
+    """The chosen laws with their estimates."""
+    fit, residuals = estimates.fit, [(k, f) for k, f in enumerate(after) if f is not None]
+    tracks, values = [f.track for _, f in residuals], law_values(problem, fit)
+    forces = forces_along(problem, fit.model, [(k, f.track) for k, f in residuals])
+    found: list[_LawFound] = []
+    for row, law in enumerate(fit.candidate.new, len(fit.candidate.kept)):
+        parameters = estimates_of(problem, estimates, row, law[1])
+        unreached = find_unreached_edges(problem, fit, law, tracks, criteria.bounded**2)
+        if unreached:
+            half_m = estimates.half_of(effect_variables(problem, fit)[row], effect(law[1]).edges)
+            parameters = open_parameters(law[1], values[law], half_m, unreached, parameters)
+        residual_n = np.concatenate([f.force_n[law[0]] for _, f in residuals])
+        found.append(_LawFound(*law, forces[row][1], residual_n, parameters, unreached))
+    return found
+
+
+def _effects(
+    problem: Problem,
+    laws: Sequence[_LawFound],
+    tracks: Sequence[Track],
     evidence: Mapping[StrutEffect, Evidence],
 ) -> tuple[FoundEffect, ...]:
     """The chosen laws, strongest first."""
-    model, residuals = estimates.fit.model, [(k, f) for k, f in enumerate(after) if f is not None]
-    first = len(model.candidate.kept)
-    forces = forces_along(problem, model, [(k, f.track) for k, f in residuals])
     effects: list[FoundEffect] = []
-    for row, (strut, name) in enumerate(model.candidate.new, first):
-        residual = np.concatenate([f.force_n[strut] for _, f in residuals])
-        parameters = estimates_of(problem, estimates, row, name)
-        found = _describe_effect(problem, (strut, name), residual, forces[row][1], parameters)
-        heights_m = np.concatenate([f.track.heights_m[strut] for _, f in residuals])
-        velocities = np.concatenate([f.track.velocities_m_per_s[strut] for _, f in residuals])
-        where = find_acting_range(heights_m, velocities, forces[row][1], residual)
-        effects.append(replace(found, evidence=evidence.get((strut, name)), where=where))
+    for law in laws:
+        at = law.strut, law.name
+        found = _describe_effect(problem, at, law.residual_n, law.force_n, law.parameters)
+        heights_m = np.concatenate([track.heights_m[law.strut] for track in tracks])
+        velocities = np.concatenate([track.velocities_m_per_s[law.strut] for track in tracks])
+        where = find_acting_range(heights_m, velocities, law.force_n, law.residual_n)
+        effects.append(replace(found, evidence=evidence.get(at), where=where))
     return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
+
+
+def _open_preloads(
+    problem: Problem, corrections: Sequence[LinearCorrection], laws: Sequence[_LawFound]
+) -> tuple[LinearCorrection, ...]:
+    """Corrections with the intervals of preloads that an edge which was not reached decides."""
+    unreached: dict[str, tuple[UnreachedEdge, ...]] = {}
+    for law in laws:
+        strut = problem.spec.struts[law.strut].name
+        unreached[strut] = unreached.get(strut, ()) + law.unreached
+    return tuple(
+        replace(item, total=open_preload(item.total, unreached.get(item.strut, ())))
+        if item.parameter == PARAMETERS["preload"]
+        else item
+        for item in corrections
+    )
 
 
 def _describe_effect(
@@ -517,7 +593,9 @@ def _collect_series(
     ]
 
 
-def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[str, ...]:
+def _notes(
+    problem: Problem, search: SearchResult, laws: Sequence[_LawFound], *, by_blocks: bool
+) -> tuple[str, ...]:
     notes = [*problem.assumptions]
     if outliers := sum({grid.recording: grid.outliers for grid in problem.grids}.values()):
         notes.append(f"{outliers} heights are outliers and were removed.")
@@ -537,7 +615,7 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
             "The intervals assume that the scale of the applied force is right: where that is "
             "wrong by 1 %, masses, stiffnesses, damping and forces are, too."
         )
-    notes += _notes_of_tolerances(problem, search.chosen.fit)
+    notes += _notes_of_tolerances(problem, search.chosen.fit, laws)
     if _resembles_hold(problem, search.chosen.fit):
         notes.append(
             "The delay is half a sampling interval, which a zero-order hold of the applied force "
@@ -581,10 +659,16 @@ def _notes_of_zero_and_gain(problem: Problem, estimates: FitEstimates) -> tuple[
     return tuple(notes)
 
 
-def _notes_of_tolerances(problem: Problem, result: Fit) -> list[str]:
-    """Corrections that are far beyond the accuracy that the model file states, or a usual one."""
+def _notes_of_tolerances(problem: Problem, result: Fit, laws: Sequence[_LawFound]) -> list[str]:
+    """Corrections that are far beyond the accuracy that the model file states, or a usual one.
+
+    A preload that an edge decides which was not reached is not known.
+    """
     notes: list[str] = []
+    is_open = {law.strut for law in laws if any(edge.force_n_per_m for edge in law.unreached)}
     for parameter, change in zip(problem.linear, result.parts.linear, strict=True):
+        if parameter.kind == "preload" and parameter.strut in is_open:
+            continue
         times, key = abs(float(change)) / parameter.deviation, PARAMETERS[parameter.kind]
         is_stated = getattr(problem.spec.tolerance, key, None) is not None
         if times > (_FAR if is_stated else IMPROBABLE):
@@ -644,6 +728,20 @@ def _notes_of_bounds(problem: Problem, estimates: FitEstimates) -> tuple[str, ..
                     f"({text}): the data may require a value beyond it, and "
                     "its interval is not to be relied on."
                 )
+    return tuple(notes)
+
+
+def _notes_of_edges(problem: Problem, laws: Sequence[_LawFound]) -> tuple[str, ...]:
+    """Edges of play and stops that the motion did not reach."""
+    notes: list[str] = []
+    for law in laws:
+        for edge in law.unreached:
+            which, beyond = ("upper", "above") if edge.side > 0 else ("lower", "below")
+            notes.append(
+                f"The {which} edge of {law.name} of strut {problem.spec.struts[law.strut].name} "
+                f"was not reached: it is at {edge.nearest_m:.4g} m or {beyond}. A run with "
+                f"{effect(law.name).excitation} shows it."
+            )
     return tuple(notes)
 
 
