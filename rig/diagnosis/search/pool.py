@@ -58,7 +58,12 @@ from rig.diagnosis.search.screen import (
     stage_of,
     whole_stage_of,
 )
-from rig.diagnosis.search.validity import find_defect, new_laws, smooth_tracks
+from rig.diagnosis.search.validity import (
+    find_defect,
+    find_improbable_linear_part,
+    new_laws,
+    smooth_tracks,
+)
 
 Array = NDArray[np.float64]
 
@@ -85,6 +90,9 @@ model leaves: a fit that comes nowhere near is in another valley."""
 _STUCK = 2.0
 """Ratio of a converged fit's sum of squares to that of its linearisation from which on it is
 stuck: right models end at 1, beside dry friction at 1.2."""
+_FAR = 2.0
+"""Standard deviations of the model file from which on a linear parameter is looked for nearer to
+it: one in twenty is as far."""
 _TINY = 1e-100
 """Least divisor."""
 _REVERSING = 0.02
@@ -248,16 +256,64 @@ class Pool:
                     self._keep(candidate, model)
 
     def _fit_from(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
-        """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
+        """Fit a model; where its linear part ends far from the file's, once more from there.
 
-        One that is not near its promise even where it is held the most is not let go: free it would
-        be farther off. `least` is the sum of squares of the best model before. None, too, where a
-        fit began there before: its result is known.
+        A law that imitates a part of inertia, spring or damper does so along a valley, a long one
+        where the motion is one orbit of a sine. A fit that decides comes from both ends of it.
+        `least` is the sum of squares of the best model before. None, too, where a fit began there
+        before: its result is known.
         """
         key = begin.key, effort
         if key in self.begun:
             return None
         self.begun.add(key)
+        result = self._fit_or_let_go(begin, effort, least)
+        if result is None or not self._is_far_from_file(result, effort):
+            return result
+        other = self._fit_from_file(result.model)
+        if other is None or self._is_likelier(result, other):
+            return result
+        return other if effort is ROUGH else self._refit(self.problem, Begin(other.model), effort)
+
+    def _is_far_from_file(self, result: Fit, effort: Effort) -> bool:
+        """Whether a fit's linear part is improbable, or that of one that decides not the file's."""
+        if effort is FULL and bool(np.any(np.abs(self._deviations(result)) > _FAR)):
+            return True
+        best = self.fits.get(nominal(self.problem))
+        lawless = (self.given if best is None else best.fit).parts.linear
+        why = find_improbable_linear_part(
+            self.problem, result.candidate.new, result.parts.linear, lawless, self.criteria
+        )
+        return why is not None
+
+    def _fit_from_file(self, model: CandidateModel) -> Fit | None:
+        """Fit a model from the file's linear part on, its laws alone before."""
+        expected = np.array([p.expected for p in self.problem.linear])
+        at_file = model._replace(parts=model.parts._replace(linear=expected))
+        alone = fit(self.problem, at_file, np.zeros(len(expected), dtype=np.bool_), ROUGH)
+        return None if alone is None else self._refit(self.problem, Begin(alone.model), ROUGH)
+
+    def _deviations(self, result: Fit) -> Array:
+        """Standard deviations of a fit's linear parameters from what the file says, shape (L,)."""
+        linear = self.problem.linear
+        offsets = result.parts.linear - np.array([p.expected for p in linear])
+        return offsets / np.array([p.deviation for p in linear])
+
+    def _is_likelier(self, one: Fit, other: Fit) -> bool:
+        """Whether a fit is likelier than another one, priors of the linear part included."""
+        level = max(1.0, min(one.mean_square, other.mean_square))
+        first, second = (
+            result.solution.cost + level * float(np.sum(self._deviations(result) ** 2))
+            for result in (one, other)
+        )
+        return first < second
+
+    def _fit_or_let_go(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
+        """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
+
+        One that is not near its promise even where it is held the most is not let go: free it would
+        be farther off.
+        """
         result = self._refit(self.problem, begin, effort)
         reached = np.inf if result is None else result.mean_square
         parted = reached > _PARTED * begin.promised and begin.promised <= _RIGHT
