@@ -65,7 +65,7 @@ def find_unreached_edges(
     heights_m = np.concatenate([track.heights_m[law[0]] for track in tracks])
     stroke_m = float(np.ptp(heights_m))
     values = result.parts.effects[_slot(problem, result, law)]
-    most_cost = result.solution.cost + least_gain * max(result.mean_square, 1.0)
+    most_cost = _cost(problem, result.model) + least_gain * max(result.mean_square, 1.0)
     found: list[UnreachedEdge] = []
     for row, side in enumerate((-1, 1)):
         away = np.zeros(2)

@@ -46,7 +46,7 @@ from rig.diagnosis.search.criteria import (
     STORING,
     SelectionCriteria,
 )
-from rig.diagnosis.search.fit import Fit, fit, project_out_fit, validation_costs
+from rig.diagnosis.search.fit import Fit, fit, model_for, project_out_fit, validation_costs
 from rig.diagnosis.search.score_test import ModelChange, find_changes
 from rig.diagnosis.search.screen import (
     Screening,
@@ -62,6 +62,7 @@ from rig.diagnosis.search.validity import (
     find_defect,
     find_improbable_linear_part,
     new_laws,
+    size_in_deviations,
     smooth_tracks,
 )
 
@@ -254,6 +255,22 @@ class Pool:
                     self.converged.add(candidate)
                 if model is not None:
                     self._keep(candidate, model)
+        self._leave_out_weakest([candidate for candidate, _ in jobs], effort)
+
+    def _leave_out_weakest(self, candidates: Sequence[Candidate], effort: Effort) -> None:
+        """Fit models that are better than all valid ones, but invalid, without their weakest law.
+
+        It was a step towards a better formula of another law, beside which it is superfluous.
+        """
+        for candidate in candidates:
+            model, valid = self.fits.get(candidate), list(self.valid())
+            if model is None or model.size < 2 or candidate not in self.invalid or not valid:
+                continue
+            if model.cost < min(other.cost for other in valid):
+                sizes = size_in_deviations(self.problem, model.fit)
+                if sizes:
+                    smaller = candidate.without(min(sizes, key=sizes.__getitem__))
+                    self.attempt(model_for(self.problem, model.fit.model, smaller), effort)
 
     def _fit_from(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
         """Fit a model; where its linear part ends far from the file's, once more from there.

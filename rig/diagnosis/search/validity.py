@@ -97,7 +97,18 @@ def new_laws(result: Fit) -> list[tuple[int, str]]:
 
 
 def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str | None:
-    """Reason against a law whose size, the linear part projected out, does not differ from zero."""
+    """Reason against a law whose size does not differ from zero."""
+    for (_, name), size in size_in_deviations(problem, result).items():
+        if size < criteria.bounded:
+            return f"its size is not identifiable from these data ({name})"
+    return None
+
+
+def size_in_deviations(problem: Problem, result: Fit) -> dict[StrutEffect, float]:
+    """Size of each law, in standard deviations from zero, the linear part projected out.
+
+    Laws without a size of their own are left out.
+    """
     variables = effect_variables(problem, result)
     jacobian, residual = result.solution.jacobian, result.solution.residual
     starts = start_variables(problem, result)
@@ -105,7 +116,8 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
     nuisance = jacobian[:, linear | starts]
     nuisance = nuisance[:, np.linalg.norm(nuisance, axis=0) > 0.0]
     basis = np.linalg.qr(nuisance / np.linalg.norm(nuisance, axis=0))[0]
-    for row, name in new_laws(result):
+    found: dict[StrutEffect, float] = {}
+    for law, (row, name) in zip(result.candidate.new, new_laws(result), strict=True):
         scaled = variables[row][list(effect(name).scaled)]
         if not len(scaled):
             continue
@@ -120,9 +132,8 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
         scores = np.bincount(result.blocks, response * residual)
         white = np.sqrt(power / max(result.mean_square, 1.0))
         robust = power / max(float(np.linalg.norm(scores)), _TINY)
-        if min(float(white), robust) < criteria.bounded:
-            return f"its size is not identifiable from these data ({name})"
-    return None
+        found[law] = min(float(white), robust)
+    return found
 
 
 def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
