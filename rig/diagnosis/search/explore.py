@@ -47,6 +47,8 @@ best by a regression may be the best in simulation."""
 _TIE = 1.05
 """Times the cost that the best change promises, up to which others of the same families are fitted:
 a linearisation is not better than that."""
+_MUCH = 0.5
+"""Share of a model's cost below which a change of it promises much: an RMS of 70 %."""
 _SELDOM = 0.01
 """Share of the time in which a strut has to pull for a contact to be lost in it."""
 
@@ -164,15 +166,19 @@ def _try_formulas(pool: Pool) -> None:
 
     Near the noise floor a wrong formula is likelier than a missing law, and linearised about the
     model the right one may not stand out: where it is more general, it promises nothing at all.
+    Those that promise much come first: about a better model others promise something else.
     """
-    for _ in range(pool.criteria.most_laws):
+    for _ in range(2 * pool.criteria.most_laws):
         best = pool.converge_least()
         is_near = best.cost < pool.criteria.settled**2 * pool.highest_at_floor(best)
         if not (best.size and is_near) or pool.at_floor(best):
             return
         laws = best.fit.candidate.new
         exchanges = [it for it in pool.changes(best) if len(it.laws) == len(laws)]
-        pool.attempt_changes(exchanges, no_progress)
+        promising = [it for it in exchanges if it.cost < _MUCH * best.cost]
+        pool.attempt_changes(promising, no_progress)
+        if pool.least() is best:
+            pool.attempt_changes(exchanges, no_progress)
         if pool.least() is best:
             return
 
