@@ -336,7 +336,7 @@ def test_a_corrected_model_costs_half_a_tick_more(capsys):
     """Laws of a single state at most; each element of Iwan's is a state of its own."""
     found = compare_rounds(corrected_subjects(), capsys)
     for name, times in found.items():
-        most = 2.3 if "eight" in name else 1.6  # measured: 1.9, and 1.15 to 1.46
+        most = 2.6 if "eight" in name else 1.75  # measured: 1.9, and 1.15 to 1.46
         assert np.median(times / found["nominal model"]) <= most
 
 
