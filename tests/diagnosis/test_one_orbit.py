@@ -77,7 +77,7 @@ def diagnosed(effect):
     [
         pytest.param(Cubic(), "nonlinear_stiffness", marks=pytest.mark.slow),
         (Friction(), "friction"),
-        (Hysteresis(), "hysteresis"),
+        pytest.param(Hysteresis(), "hysteresis", marks=pytest.mark.slow),
     ],
 )
 def test_a_law_of_the_catalogue_is_found_with_its_parameters(effect, family):
