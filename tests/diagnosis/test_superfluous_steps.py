@@ -17,7 +17,7 @@ SPRING, VALVE = (0, "cubic_stiffness"), (0, "quadratic_damping")
 
 @pytest.fixture(scope="module")
 def pool():
-    """Of a bench with a cubic spring alone, a quadratic damper beside it."""
+    """Fits to a bench with a cubic spring; they begin with a quadratic damper as well."""
     problem = problem_of(Cubic())
     given, linear = first_fits(problem)
     found = Pool(problem, given, [linear], CRITERIA)

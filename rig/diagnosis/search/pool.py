@@ -177,6 +177,11 @@ class Pool:
         return stage_of(self.problem, self.linear.fit.model)
 
     @cached_property
+    def linear_of_file(self) -> Array:
+        """Linear parameters as the model file, and delays as an estimate, have them, shape (L,)."""
+        return np.array([p.expected for p in self.problem.linear])
+
+    @cached_property
     def held(self) -> tuple[Problem, ...]:
         """Problems of models that are held to the measured motion, less and less."""
         problems = (self.problem.held_to(self.along, share) for share in _HELD)
@@ -305,16 +310,15 @@ class Pool:
 
     def _fit_from_file(self, model: CandidateModel) -> Fit | None:
         """Fit a model from the file's linear part on, its laws alone before."""
-        expected = np.array([p.expected for p in self.problem.linear])
-        at_file = model._replace(parts=model.parts._replace(linear=expected))
-        alone = fit(self.problem, at_file, np.zeros(len(expected), dtype=np.bool_), ROUGH)
+        at_file = model.with_linear(self.linear_of_file)
+        none_free = np.zeros(len(self.linear_of_file), dtype=np.bool_)
+        alone = fit(self.problem, at_file, none_free, ROUGH)
         return None if alone is None else self._refit(self.problem, Begin(alone.model), ROUGH)
 
     def _deviations(self, result: Fit) -> Array:
         """Standard deviations of a fit's linear parameters from what the file says, shape (L,)."""
-        linear = self.problem.linear
-        offsets = result.parts.linear - np.array([p.expected for p in linear])
-        return offsets / np.array([p.deviation for p in linear])
+        offsets = result.parts.linear - self.linear_of_file
+        return offsets / np.array([p.deviation for p in self.problem.linear])
 
     def _is_likelier(self, one: Fit, other: Fit) -> bool:
         """Whether a fit is likelier than another one, priors of the linear part included."""
@@ -419,8 +423,7 @@ class Pool:
         """
         values = [existing_values(self.problem, nominal(self.problem))]
         values += [laws[law] for law in candidate.new]
-        linear = np.array([p.expected for p in self.problem.linear])
-        model = self._fit_starts(candidate, linear, np.concatenate(values))
+        model = self._fit_starts(candidate, self.linear_of_file, np.concatenate(values))
         self._fit_each([(candidate, partial(Begin, model, promised=promised))], FULL, no_progress)
 
     def adopt(self, result: Fit) -> None:
