@@ -50,8 +50,8 @@ def check_command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="With --model: write an excitation (CSV) that shows what the recordings leave "
-            "open, within their stroke.",
+            help="With --model: write an excitation (CSV) that is rich in frequencies and "
+            "amplitudes, within the recorded stroke.",
         ),
     ] = None,
     out: SummaryFolder = None,
@@ -64,10 +64,11 @@ def check_command(
 
     With --model, recordings are checked before they are diagnosed: stroke, speeds, frequencies,
     noise; which linear parameters and which families of laws they can determine; what to record in
-    addition. The bounds are those of a right model: a diagnosis does no better. With --excitation
-    this is planned: slow cycles, a sweep through the resonance and a multisine, of a bench of one
-    strut; the force is that of the model, so the bench moves as planned as far as the model is
-    right. Check it against the limits of your bench before you run it.
+    addition. No diagnosis determines a linear parameter better; of a family, the force is that of
+    a law of middling visibility. With --excitation, slow cycles, a sweep through the resonance and
+    a multisine are planned within 70 % of the recorded stroke, for a dyno, or for a bench of one
+    strut that is driven by one force. This force is what masses, linear spring and damper of the
+    model need for the motion. Check it against the limits of your bench before you run it.
     """
     if model is not None:
         _check_recordings(paths, model, excitation, out, as_json=as_json, junit=junit)

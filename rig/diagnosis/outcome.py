@@ -325,7 +325,7 @@ class Diagnosis:
         ambiguous_with: Families that these recordings cannot distinguish from the effects.
         suggested_excitation: A recording that would distinguish them, or confirm candidates.
         left: RMS residual of the effects, out of sample, as a share of the best linear model's;
-            None without effects, or where none explains.
+            None without laws of the search.
         held_out: Figures on data that took no part in the search.
         noise_floor: RMS that a right model can reach there.
         residual_white: Whether the residual is white.

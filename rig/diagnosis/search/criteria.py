@@ -27,7 +27,8 @@ class SelectionCriteria:
             describes it as well (measured dampers: the fourth gains less than the scatter between
             recordings).
         fitted_a_size: Combinations of each size that are fitted in simulation, apart from subsets
-            of theirs; changes of a fitted model likewise.
+            of theirs; of the changes of a fitted model so many additions, with two exchanges of
+            each law, and those of the same families that promise as much as the best.
         hopeless: Times the sum of squares of the best combination of a size, along the motion, from
             which on a combination of that size is not fitted in simulation, and a fitted model not
             near the best: smoothing the motion costs laws that switch a factor of two at most.
@@ -42,8 +43,8 @@ class SelectionCriteria:
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
             law, a better formula or a linear correction. The best of some hundred useless starts
             gains 2 ln 100 = 9 by chance; an autocorrelated residual that much more often.
-        least_share: Least share by which a further law reduces the mean square above the noise
-            floor; 0.19 is a tenth of the RMS.
+        least_share: Least share by which a further law reduces the mean square above the sensors'
+            noise; 0.19 is a tenth of the RMS.
         least_above_noise: Mean square above the noise floor, as a share of the floor, below which
             no first law is searched: integration and interpolation err by as much.
         scatter: Standard deviations of the mean square of as many samples of white noise, that of

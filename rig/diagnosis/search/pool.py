@@ -332,8 +332,8 @@ class Pool:
     def _fit_or_let_go(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
         """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
 
-        One that is not near its promise even where it is held the most is not let go: free it would
-        be farther off.
+        One that is not near its promise even where it is held is given up: free it would be farther
+        off.
         """
         result = self._refit(self.problem, begin, effort)
         reached = np.inf if result is None else result.mean_square

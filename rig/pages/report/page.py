@@ -64,7 +64,7 @@ _SPLITS = {
     "and fit.",
 }
 _PACKAGES = ("rig", "dartpy", "numpy", "scipy", "numba")
-_OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only input.",)
+_OF_A_FREE_RUN = ("Nothing but the measured inputs drives the free-run simulation.",)
 
 
 def write_report(result: Result, path: Path, labels: Mapping[str, str] | None = None) -> None:
