@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 
 from dart_model.spec import ModelSpec
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE
+from rig.diagnosis.numerics.hermite import read_late
 from rig.diagnosis.problem.problem import LinearParameter
 from rig.recordings.recording import Recording
 from rig.recordings.recording_checks import inputs_of
@@ -149,35 +150,8 @@ def late_columns(t_s: Array, values: Array, rates: Array | None, delays_s: Array
             known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
             late[:, column] = CubicSpline(t_s, values[:, column])(known_s)
         else:
-            late[:, column] = _read_hermite(t_s, values[:, column], rates[:, column], delay_s)
+            late[:, column] = read_late(t_s, values[:, column], rates[:, column], delay_s)
     return late
-
-
-def _read_hermite(t_s: Array, values: Array, rates: Array, delay_s: float) -> Array:
-    """Values (N, ...) before a delay: Hermite's cubic by their rates, which go on beyond the ends.
-
-    Own lines instead of `scipy.interpolate.CubicHermiteSpline`, which was set up for each column: a
-    third of the time of a fit's derivatives.
-    """
-    known_s = np.clip(t_s - delay_s, t_s[0], t_s[-1])
-    first = np.clip(np.searchsorted(t_s, known_s, side="right") - 1, 0, len(t_s) - 2)
-    step_s = t_s[first + 1] - t_s[first]
-    share = (known_s - t_s[first]) / step_s
-    beyond_s = t_s - delay_s - known_s
-    rest = 1.0 - share
-    weights = (
-        rest**2 * (1.0 + 2.0 * share),
-        share**2 * (1.0 + 2.0 * rest),
-        step_s * share * rest**2 + np.minimum(beyond_s, 0.0),
-        -step_s * rest * share**2 + np.maximum(beyond_s, 0.0),
-    )
-    by_row = [weight.reshape(-1, *[1] * (values.ndim - 1)) for weight in weights]
-    return (
-        by_row[0] * values[first]
-        + by_row[1] * values[first + 1]
-        + by_row[2] * rates[first]
-        + by_row[3] * rates[first + 1]
-    )
 
 
 def known_share(t_s: Array, delays_s: Array) -> Array:
