@@ -24,7 +24,7 @@ from rig.diagnosis.problem.problem import (
 )
 from rig.diagnosis.progress import Progress, no_progress, within
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
-from rig.diagnosis.search.explore import FirstRound, explore
+from rig.diagnosis.search.explore import FirstRound, search_about_models, search_along_motion
 from rig.diagnosis.search.fit import WITH_MEMORY, Fit, fit
 from rig.diagnosis.search.model_selection import SearchResult, select_model
 from rig.diagnosis.search.pool import Pool, ValidatedModel
@@ -232,11 +232,11 @@ def _explore_twice(
     """
     given, linear = fits
     first = Pool(problem, given, [linear], criteria)
-    first_round = explore(first, within(progress, 0.0, 0.3))
+    first_round = search_along_motion(first, within(progress, 0.0, 0.3))
     problem = _with_residual_noise(problem, first.chosen(criteria.most_laws).fit)
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
-    explore(second, within(progress, 0.3, 1.0))
+    search_about_models(second, within(progress, 0.3, 1.0))
     return _Explored(first, second, first_round)
 
 
@@ -258,7 +258,7 @@ def _fit_to_all(
         pool.adopt(model.fit)
     pool.converge_best()
     if not pool.is_formula(pool.least()):
-        explore(pool, within(progress, 0.5, 1.0))
+        search_about_models(pool, within(progress, 0.5, 1.0))
     return pool
 
 

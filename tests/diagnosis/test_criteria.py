@@ -9,7 +9,7 @@ import pytest
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.explore import explore
+from rig.diagnosis.search.explore import search_along_motion
 from rig.diagnosis.search.pool import Pool
 from tests.criteria_study.cases import CASES, answer
 
@@ -81,7 +81,7 @@ def explored(criteria):
     problem = build(spec, runs, criteria.blocks, None)
     given, linear = first_fits(problem)
     pool = Pool(problem, given, [linear], criteria)
-    explore(pool, lambda _what, _share: None)
+    search_along_motion(pool, lambda _what, _share: None)
     return pool
 
 
@@ -103,7 +103,9 @@ def test_a_pair_that_is_but_a_better_formula_for_one_law_is_not_worth_it(absurd,
 
     def leaving(model, above):
         share = (rows + above) / model.block_costs.sum()
-        return model._replace(block_costs=share * model.block_costs)
+        solution = model.fit.solution._replace(cost=rows + above)
+        fitted = model.fit._replace(solution=solution)
+        return model._replace(fit=fitted, block_costs=share * model.block_costs)
 
     nearly = leaving(one, 1e-3 * pool.linear.cost)
     assert pool.is_formula(nearly) is ("formula" not in absurd)

@@ -128,6 +128,15 @@ def test_a_like_law_begins_where_its_force_is_the_other_ones():
     assert like.model.parts.effects[0] == pytest.approx(fitted.parts.effects[0], rel=0.3)
 
 
+def test_a_formula_that_is_nowhere_like_that_of_the_model_is_no_change_of_it():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3], cubic_stiffness=[1e5])
+    exchanges = [change.laws for change in changes_of(pool, fitted) if len(change.laws) == 2]
+    others = {name for laws in exchanges for _, name in laws}
+    assert {"stribeck_friction", "power_stiffness"} <= others
+    assert {"quadratic_stiffness", "plateau_stiffness"}.isdisjoint(others)
+
+
 def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
     pool = pool_of(little_bench, FrictionAndHardening())
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])

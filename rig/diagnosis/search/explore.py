@@ -60,30 +60,33 @@ class FirstRound(NamedTuple):
     screenings: tuple[Screening, ...]
 
 
-def explore(pool: Pool, progress: Progress) -> FirstRound | None:
-    """Fit models that may be chosen, starting from the linear model or the best of several seeds.
+def search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
+    """Find models with laws by their forces along the measured motion.
 
-    The result is the first round about the linear model, where there was one.
+    The result is the round of single laws, where there was one.
     """
-    first = None
-    if len(pool.fits) > 1:
-        _expand_best(pool, progress)
-        known = pool.least().fit.candidate
-        _try_damper_with_friction(pool)
-        _try_lost_contacts(pool)
-        if pool.least().fit.candidate != known:
-            # Its other laws were chosen beside a damper or friction that imitated both.
-            _expand_best(pool, progress)
-    else:
-        first = _search_along_motion(pool, progress)
-        _try_damper_with_friction(pool)
-        _try_lost_contacts(pool)
-    _try_formulas(pool)
+    first = _fit_screened(pool, progress)
     pool.converge_best()
     return first
 
 
-def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
+def search_about_models(pool: Pool, progress: Progress) -> None:
+    """Find better models by changing laws of the best ones; along the motion if there are none."""
+    if len(pool.fits) == 1:
+        _fit_screened(pool, progress)
+    else:
+        _expand_best(pool, progress)
+    known = pool.least().fit.candidate
+    _try_damper_with_friction(pool)
+    _try_lost_contacts(pool)
+    if pool.least().fit.candidate != known:
+        # Its other laws were chosen beside a damper or friction that imitated both.
+        _expand_best(pool, progress)
+    _try_formulas(pool)
+    pool.converge_best()
+
+
+def _fit_screened(pool: Pool, progress: Progress) -> FirstRound | None:
     """Screen combinations of one law, of two, ..., and fit the best of each size."""
     criteria = pool.criteria
     if pool.at_floor(pool.linear):
@@ -219,7 +222,8 @@ def _expand(pool: Pool, reference: ValidatedModel, progress: Progress) -> None:
     laws = reference.fit.candidate.new
     bases = [tuple(other for other in laws if other != law) for law in laws]
     # A model that is nearly right more likely has a wrong formula than one law too few.
-    bases.insert(len(bases) if pool.is_formula(reference) else 0, laws)
+    is_last = pool.is_formula(reference) and len(laws) < pool.criteria.most_laws
+    bases.insert(len(bases) if is_last else 0, laws)
     for i, base in enumerate(bases):
         begin, end = _EXPLORED * i / len(bases), _EXPLORED * (i + 1) / len(bases)
         part = within(progress, begin, end)
@@ -254,7 +258,9 @@ def _expand_in_simulation(
         return
     progress("screening laws", 0.0)
     model = pool.fits[candidate]
-    least = model.fit.solution.cost - pool.criteria.least_likelihood_gain
+    # What a linearisation promises is wrong by a factor, too.
+    hopeless = pool.criteria.hopeless**2 * pool.least().fit.solution.cost
+    least = min(model.fit.solution.cost - pool.criteria.least_likelihood_gain, hopeless)
     known = {c: fitted.fit.solution.cost for c, fitted in pool.fits.items()}
     at_floor = pool.highest_at_floor(model)
     changes = [
@@ -265,7 +271,8 @@ def _expand_in_simulation(
         and (change.unchanged > at_floor or not set(base) <= set(change.laws))
     ]
     changes = _plainest_first(changes, at_floor)
-    chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size)
+    enough = model.fit.solution.cost - pool.criteria.least_share * model.excess
+    chosen = _promising(changes, candidate.new, pool.criteria.fitted_a_size, enough)
     pool.attempt_changes(chosen, within(progress, 0.5, 1.0))
 
 
@@ -284,17 +291,19 @@ def _plainest_first(changes: Sequence[ModelChange], at_floor: float) -> list[Mod
 
 
 def _promising(
-    changes: Sequence[ModelChange], laws: Sequence[StrutEffect], count: int
+    changes: Sequence[ModelChange], laws: Sequence[StrutEffect], count: int, enough: float
 ) -> list[ModelChange]:
     """The best changes of a model that add a law, and those that exchange each of its laws.
 
     Two like laws of each are fitted, and what promises as much as the best one: a damper's formula
-    is not to be left because a better one for its friction comes first.
+    is not to be left because a better one for its friction comes first. Additions that do not come
+    below `enough`, what a law has to gain, promise as much as others by chance.
     """
     additions = [change for change in changes if set(laws) <= set(change.laws)]
     chosen = _diverse(additions, count)
     known = {change.laws for change in chosen}
-    chosen += [it for it in additions if it.laws not in known and _ties(it, chosen[0])]
+    others = [it for it in additions if it.laws not in known and _ties(it, chosen[0])]
+    chosen += [it for it in others if it.cost < enough]
     for law in laws:
         others = [change for change in changes if law not in change.laws]
         chosen += [it for i, it in enumerate(others) if i < _ALIKE or _ties(it, others[0])]

@@ -96,6 +96,8 @@ _FAR = 2.0
 it: one in twenty is as far."""
 _TINY = 1e-100
 """Least divisor."""
+_MOVED = 0.01
+"""Share by which a fit's sum of squares falls from which on its changes are looked at again."""
 _REVERSING = 0.02
 """Velocity, as a share of its RMS, below which friction changes its sign."""
 
@@ -524,10 +526,12 @@ class Pool:
     def changes(self, model: ValidatedModel) -> tuple[ModelChange, ...]:
         """Changes of a model by one law, as a score test about its fit ranks them."""
         candidate = model.fit.candidate
-        if candidate not in self.tested or self.tested[candidate][0] is not model:
+        known = self.tested.get(candidate)
+        if known is None or model.cost < (1.0 - _MOVED) * known[0].cost:
             most = self.criteria.most_laws
-            self.tested[candidate] = model, find_changes(self.problem, model.fit, self.along, most)
-        return self.tested[candidate][1]
+            known = model, find_changes(self.problem, model.fit, self.along, most)
+            self.tested[candidate] = known
+        return known[1]
 
     # --- whether one model is preferred to another ------------------------------------------------
 
@@ -559,7 +563,7 @@ class Pool:
 
     def at_floor(self, model: ValidatedModel) -> bool:
         """Whether a model is at the noise floor, so that a law could explain nothing more."""
-        return model.cost < self.highest_at_floor(model)
+        return model.fit.solution.cost < self.highest_at_floor(model)
 
     def highest_at_floor(self, model: ValidatedModel) -> float:
         """Sum of squares below which a model is at the noise floor."""

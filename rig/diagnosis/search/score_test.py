@@ -51,6 +51,11 @@ _MATCHING = Effort(10, sides=1)
 """Fits of a law to another one's force."""
 _TINY = 1e-100
 """Least divisor."""
+_FAR = 50.0
+"""Times the sum of squares of a model from which on another formula is not fitted that begins with
+it, where it is most alike: one that is right differs from that of the model by what this leaves. Of
+173 such fits on seven benches, those that came near the best model, to four times its sum of
+squares, began within 28 times of it; those from 50 times on took half of the time."""
 
 
 class ModelChange(NamedTuple):
@@ -126,9 +131,7 @@ def find_changes(
         tested = [
             *chain.from_iterable(pool.map(lambda jobs: _test_sized(base, jobs), batches)),
             *pool.map(lambda job: _test_addition(base, *job), whole),
-            *chain.from_iterable(
-                pool.map(lambda job: _test_exchange(base, job[0], replaced[job[1]]), exchanges)
-            ),
+            *pool.map(lambda job: _test_exchange(base, job[0], replaced[job[1]]), exchanges),
         ]
     best: dict[Candidate, ModelChange] = {}
     for change in sorted((c for c in tested if c is not None), key=lambda change: change.cost):
@@ -193,21 +196,28 @@ def _remove_law_force(base: _Base, at: StrutEffect) -> _ReplacedLaw:
     return _ReplacedLaw(at, values, linear, force_n - linear @ (linear.T @ force_n))
 
 
-def _test_exchange(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> list[ModelChange]:
-    """Exchanges of a law for another, from each of its starts and from where it is most alike.
+def _test_exchange(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> ModelChange | None:
+    """Exchange of a law for another, from where this is most alike; None if it is not alike.
 
     A law that is more general than the replaced one is that one where it is most alike, and shows
     nothing of what it may gain.
     """
     candidate = base.fit.candidate.without(old.law).with_effects(at)
-    tested: list[ModelChange] = []
+    begins: list[tuple[float, ModelChange]] = []
     for values in _match_force(base, at, old):
         column = _response(base, candidate, at, values)
         if column is not None:
             # A share of the way from the old law to this one.
             size = float(np.clip(_best_size(base, column), 0.0, 1.0))
-            tested.append(_change(base, candidate, at, values, size * column))
-    return tested
+            whole = base.residual - column
+            change = _change(base, candidate, at, values, size * column)
+            begins.append((float(whole @ whole), change))
+    if not begins:
+        return None
+    begin, nearest = min(begins, key=lambda begin: begin[0])
+    if begin > _FAR * nearest.unchanged:
+        return None
+    return nearest._replace(cost=min(change.cost for _, change in begins))
 
 
 def _match_force(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> list[Array]:

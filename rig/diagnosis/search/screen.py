@@ -543,13 +543,19 @@ def refine(stage: Stage, laws: Sequence[StrutEffect], values: Sequence[Array]) -
     """All parameters of a combination of laws, fitted together along the motion."""
     values = [_with_shift(name, own) for (_, name), own in zip(laws, values, strict=True)]
     ends = np.cumsum([len(own) for own in values])[:-1]
+    known: list[dict[bytes, Array]] = [{} for _ in laws]
+    """Responses of each law of the last call, by its parameters."""
 
     def residuals_of(points: Array) -> Array:
         residuals = np.repeat(stage.target[:, np.newaxis], len(points), axis=1)
-        for at, own in zip(laws, np.split(points, ends, axis=1), strict=True):
+        for i, (at, own) in enumerate(zip(laws, np.split(points, ends, axis=1), strict=True)):
             # A difference changes one parameter: the other laws respond as before.
-            each, which = np.unique(own, axis=0, return_inverse=True)
-            residuals -= responses(stage, at, list(each))[:, which]
+            each = {point.tobytes(): point for point in own}
+            new = [key for key in each if key not in known[i]]
+            columns = responses(stage, at, [each[key] for key in new]).T if new else ()
+            every = known[i] | dict(zip(new, columns, strict=True))
+            known[i] = {key: every[key] for key in each}
+            residuals -= np.column_stack([known[i][point.tobytes()] for point in own])
         return residuals
 
     spaces = [_space(stage, at, own) for at, own in zip(laws, values, strict=True)]
