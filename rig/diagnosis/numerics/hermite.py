@@ -36,8 +36,8 @@ _read = compile_loop(_read, types.void(VECTOR, _COLUMNS, _COLUMNS, F8, _COLUMNS)
 def read_late(t_s: Array, values: Array, rates: Array, delay_s: float) -> Array:
     """Values (N, ...) a delay before: Hermite's cubic by their rates, which go on beyond the ends.
 
-    Own lines instead of `scipy.interpolate.CubicHermiteSpline`, which was set up for each column: a
-    third of the time of a fit's derivatives.
+    Own lines: `scipy.interpolate.CubicHermiteSpline`, which is set up for each column, took a third
+    of the time of a fit's derivatives, and the same in numpy a fifth of that of a fit.
 
     Args:
         t_s: Times, ascending, shape (N,).

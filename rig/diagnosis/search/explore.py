@@ -302,8 +302,8 @@ def _promising(
     additions = [change for change in changes if set(laws) <= set(change.laws)]
     chosen = _diverse(additions, count)
     known = {change.laws for change in chosen}
-    others = [it for it in additions if it.laws not in known and _ties(it, chosen[0])]
-    chosen += [it for it in others if it.cost < enough]
+    gaining = [it for it in additions if it.laws not in known and it.cost < enough]
+    chosen += [it for it in gaining if _ties(it, chosen[0])]
     for law in laws:
         others = [change for change in changes if law not in change.laws]
         chosen += [it for i, it in enumerate(others) if i < _ALIKE or _ties(it, others[0])]

@@ -51,7 +51,7 @@ _MATCHING = Effort(10, sides=1)
 """Fits of a law to another one's force."""
 _TINY = 1e-100
 """Least divisor."""
-_FAR = 50.0
+_UNLIKE = 50.0
 """Times the sum of squares of a model from which on another formula is not fitted that begins with
 it, where it is most alike: one that is right differs from that of the model by what this leaves. Of
 173 such fits on seven benches, those that came near the best model, to four times its sum of
@@ -215,7 +215,7 @@ def _test_exchange(base: _Base, at: StrutEffect, old: _ReplacedLaw) -> ModelChan
     if not begins:
         return None
     begin, nearest = min(begins, key=lambda begin: begin[0])
-    if begin > _FAR * nearest.unchanged:
+    if begin > _UNLIKE * nearest.unchanged:
         return None
     return nearest._replace(cost=min(change.cost for _, change in begins))
 
