@@ -55,7 +55,7 @@ def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():
     friction = (0, "stribeck_friction")
 
     def change(cost, name):
-        return SimpleNamespace(cost=cost, laws=(friction, (0, name)))
+        return SimpleNamespace(cost=cost, begin=cost, laws=(friction, (0, name)))
 
     promised = {
         "stroke_damping": 100.0,
@@ -72,14 +72,14 @@ def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():
 def test_what_promises_as_much_as_the_best_exchange_is_fitted_too():
     play, spring = (0, "backlash"), (0, "power_stiffness")
     names = ("cubic_stiffness", "quadratic_stiffness", "exponential_stiffness")
-    alike = [SimpleNamespace(cost=100.0, laws=(play, (0, name))) for name in names]
-    worse = SimpleNamespace(cost=106.0, laws=(play, (0, "progressive_stiffness")))
+    alike = [SimpleNamespace(cost=100.0, begin=100.0, laws=(play, (0, name))) for name in names]
+    worse = SimpleNamespace(cost=106.0, begin=106.0, laws=(play, (0, "progressive_stiffness")))
     assert _promising([*alike, worse], [play, spring], 4, np.inf) == alike
 
 
 def test_further_laws_that_tie_without_gaining_what_a_law_has_to_are_two_of_a_family_and_few():
     friction = (0, "stribeck_friction")
     names = ("stroke_damping", "end_zone_damping", "valve_damping", "zone_damping")
-    alike = [SimpleNamespace(cost=100.0, laws=(friction, (0, name))) for name in names]
+    alike = [SimpleNamespace(cost=100.0, begin=100.0, laws=(friction, (0, name))) for name in names]
     assert _promising(alike, [friction], 4, 101.0) == alike
     assert _promising(alike, [friction], 4, 99.0) == alike[:2]

@@ -70,7 +70,9 @@ def test_a_fit_finds_a_free_run_from_which_it_parts_where_it_begins(promised):
     directly = fit(problem, begun, free_linear(problem, candidate), FULL)
     assert directly.mean_square > 1e6
     pool = Pool(problem, given, [linear], CRITERIA)
-    pool.attempt_changes([ModelChange(begun, promised * directly.rows)], no_progress)
+    pool.attempt_changes(
+        [ModelChange(begun, promised * directly.rows, promised * directly.rows)], no_progress
+    )
     found = pool.fits[candidate].fit
     assert found.mean_square < 1.5
     assert found.parts.effects == pytest.approx([0.4, GAP_M], rel=1e-4)
@@ -84,7 +86,7 @@ def test_a_fit_that_promised_no_more_than_the_best_model_is_left_where_it_ends()
     pool = Pool(problem, given, [linear], CRITERIA)
     law = (0, "free_play")
     begun = model_with(problem, {law: np.array([0.4, 1.01 * GAP_M])}, {})
-    pool.attempt_changes([ModelChange(begun, pool.linear.cost)], no_progress)
+    pool.attempt_changes([ModelChange(begun, pool.linear.cost, pool.linear.cost)], no_progress)
     assert pool.fits[nominal(problem).with_effects(law)].fit.mean_square > 1e3
 
 

@@ -165,7 +165,7 @@ def _try_lost_contacts(pool: Pool) -> None:
 
 
 def _try_formulas(pool: Pool) -> None:
-    """Fit the best model with every other formula for one of its laws, until none is better.
+    """Fit the best model with other formulas for one of its laws, until none is much better.
 
     Near the noise floor a wrong formula is likelier than a missing law, and linearised about the
     model the right one may not stand out: where it is more general, it promises nothing at all.
@@ -182,7 +182,7 @@ def _try_formulas(pool: Pool) -> None:
         pool.attempt_changes(promising, no_progress)
         if pool.least() is best:
             pool.attempt_changes(exchanges, no_progress)
-        if pool.least() is best:
+        if not pool.gains_share(pool.least(), best):
             return
 
 
@@ -279,13 +279,14 @@ def _expand_in_simulation(
 def _plainest_first(changes: Sequence[ModelChange], at_floor: float) -> list[ModelChange]:
     """Changes that promise the noise floor, with the fewest parameters first; then the others.
 
-    A linearisation cannot distinguish formulas that are all as good as the noise permits.
+    A linearisation cannot distinguish formulas that are all as good as the noise permits. Exchanges
+    come in the order of where their fits begin.
     """
 
     def order(change: ModelChange) -> tuple[bool, int, float]:
         is_at_floor = change.cost < at_floor
         parameters = len(change.model.parts.effects) if is_at_floor else 0
-        return not is_at_floor, parameters, change.cost
+        return not is_at_floor, parameters, change.begin
 
     return sorted(changes, key=order)
 
@@ -312,7 +313,7 @@ def _promising(
 
 def _ties(change: ModelChange, best: ModelChange) -> bool:
     """Whether a change promises as much as the best one, with laws of the same families."""
-    return change.cost < _TIE * best.cost and _families(change.laws) == _families(best.laws)
+    return change.begin < _TIE * best.begin and _families(change.laws) == _families(best.laws)
 
 
 def _families(laws: Sequence[StrutEffect]) -> tuple[str, ...]:

@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
-from os import cpu_count
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +87,11 @@ amplified by less."""
 _MISSED = 10.0
 """The same ratio for a regression or linearisation that promises as many times less than the best
 model leaves: a fit that comes nowhere near is in another valley."""
+_AT_ONCE = 2
+"""Fits that go on at a time, the same on every machine: what they reach decides which follow."""
+_SURPASSED = 4.0
+"""Times the least sum of squares from which on a promise is too little: what it was compared with
+has been surpassed by fits before."""
 _STUCK = 2.0
 """Ratio of a converged fit's sum of squares to that of its linearisation from which on it is
 stuck: right models end at 1, beside dry friction at 1.2."""
@@ -169,6 +173,7 @@ class Pool:
         self.floors: dict[Candidate, tuple[ValidatedModel, float]] = {}
         self.tested: dict[Candidate, tuple[ValidatedModel, tuple[ModelChange, ...]]] = {}
         self.begun: set[Hashable] = set()
+        self.stuck: set[Candidate] = set()
         self.attempt_all([seed.model for seed in seeds])
         base = nominal(problem)
         self.linear = self.fits.setdefault(base, self.validate(given))
@@ -241,28 +246,40 @@ class Pool:
     ) -> None:
         """Fit candidates from where they begin, and keep each that is better than an earlier fit.
 
-        Begins and fits are independent of each other, and take a thread each.
+        Begins and fits that go on at once are independent of each other, and take a thread each.
         """
         for candidate, _ in jobs:
             slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
 
-        least = min((model.fit.solution.cost for model in self.valid()), default=np.inf)
-
-        def fit_one(begin: Callable[[], Begin]) -> ValidatedModel | None:
-            result = self._fit_from(begin(), effort, least)
-            return None if result is None else self.validate(result)
-
-        with ThreadPoolExecutor(cpu_count()) as threads:
-            results = threads.map(fit_one, [begin for _, begin in jobs])
-            for i, (candidate, _) in enumerate(jobs):
-                names = ", ".join(name for _, name in candidate.new) or "the linear part"
+        with ThreadPoolExecutor(_AT_ONCE) as threads:
+            for i in range(0, len(jobs), _AT_ONCE):
+                names = ", ".join(name for _, name in jobs[i][0].new) or "the linear part"
                 progress(f"fitting {names}", i / len(jobs))
-                model = next(results)
-                if effort is FULL:
-                    self.converged.add(candidate)
-                if model is not None:
-                    self._keep(candidate, model)
+                some = jobs[i : i + _AT_ONCE]
+                fit_one = partial(self._fit_one, effort, self._least_cost())
+                for (candidate, _), model in zip(
+                    some, threads.map(fit_one, [begin for _, begin in some]), strict=True
+                ):
+                    if effort is FULL:
+                        self.converged.add(candidate)
+                    if model is not None:
+                        self._keep(candidate, model)
         self._leave_out_weakest([candidate for candidate, _ in jobs], effort)
+
+    def _least_cost(self) -> float:
+        """The least sum of squares of a valid model, infinite where there is none."""
+        return min((model.fit.solution.cost for model in self.valid()), default=np.inf)
+
+    def _fit_one(
+        self, effort: Effort, least: float, begin_at: Callable[[], Begin]
+    ) -> ValidatedModel | None:
+        """Fit a candidate; None where it has no fit, or promises `_SURPASSED` times the least."""
+        begin = begin_at()
+        is_known = math.isfinite(begin.promised)
+        if is_known and begin.promised * self.linear.fit.rows > _SURPASSED * least:
+            return None
+        result = self._fit_from(begin, effort, least)
+        return None if result is None else self.validate(result)
 
     def _leave_out_weakest(self, candidates: Sequence[Candidate], effort: Effort) -> None:
         """Fit models that are better than all valid ones, but invalid, without their weakest law.
@@ -335,24 +352,26 @@ class Pool:
         """Fit a model in free run; where that parts or is stuck, once more from one that is let go.
 
         One that is not near its promise even where it is held is given up: free it would be farther
-        off.
+        off. So is one that is stuck after it was let go once, without a gain that leads elsewhere.
         """
         result = self._refit(self.problem, begin, effort)
         reached = np.inf if result is None else result.mean_square
         parted = reached > _PARTED * begin.promised and begin.promised <= _RIGHT
         missed = reached > _MISSED * begin.promised < least / self.linear.fit.rows
         is_stuck = effort is FULL and result is not None and _is_stuck(result, least)
-        if not (parted or missed or is_stuck) or not self.held:
+        if not (parted or missed or (is_stuck and begin.model.candidate not in self.stuck)):
+            return result
+        if not self.held:
             return result
         for problem in self.held:
-            held = self._refit(problem, begin, effort)
+            held = self._refit(problem, begin, ROUGH)
             if held is not None and held.mean_square > _MISSED * begin.promised:
                 return result
             begin = begin if held is None else begin._replace(model=held.model)
         other = self._refit(self.problem, begin, effort)
-        if other is None or (result is not None and result.mean_square < other.mean_square):
-            return result
-        return other
+        if is_stuck and (other is None or other.mean_square > reached / _STUCK):
+            self.stuck.add(begin.model.candidate)
+        return result if other is None or reached < other.mean_square else other
 
     def _keep(self, candidate: Candidate, model: ValidatedModel) -> None:
         if candidate in self.fits and model.cost >= self.fits[candidate].cost:
