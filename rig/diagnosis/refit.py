@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 from dart_model.spec import ModelSpec
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.estimates import FitEstimates, estimates_of
 from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import effect_variables, fit_covariance
-from rig.diagnosis.write_up import FitEstimates, estimates_of, linear_corrections
+from rig.diagnosis.write_up import linear_corrections
 from rig.recordings.recording import Recording
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.evaluate import HeldOutLaw
+from rig.diagnosis.notes import notes_of_opposite_errors
 from rig.diagnosis.outcome import (
     Estimate,
     HeldOut,
@@ -19,7 +20,6 @@ from rig.diagnosis.problem.problem import RunEvaluation
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.evidence import LeftOutGains
 from rig.diagnosis.verdict import confirmation, confirmations, find_reason_against_laws
-from rig.diagnosis.write_up import notes_of_opposite_errors
 from tests.diagnosis import little_bench as bench
 
 FLOOR_M = 1e-5

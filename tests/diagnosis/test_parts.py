@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.effects import Motion
+from rig.diagnosis.notes import find_friction_n
 from rig.diagnosis.problem.build import build, part_of, with_tones
 from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
 from rig.diagnosis.problem.track import largest_stride, pieces
 from rig.diagnosis.search.fit import fit
-from rig.diagnosis.write_up import find_friction_n
 from tests.diagnosis import little_bench, little_dyno
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from dart_model.effects import CATALOGUE
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.estimates import FitEstimates
 from rig.diagnosis.evaluate import evaluate_held_out
 from rig.diagnosis.problem.build import (
     Problems,
@@ -20,7 +21,6 @@ from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
 from rig.diagnosis.problem.problem import Problem, nominal
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import fit_covariance, validation_costs
-from rig.diagnosis.write_up import FitEstimates
 from tests.diagnosis import little_bench, little_dyno
 
 BENCHES = {FreeRunProblem: little_bench, PrescribedProblem: little_dyno}
