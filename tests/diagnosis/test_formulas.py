@@ -7,9 +7,11 @@ import pytest
 
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.progress import no_progress
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.explore import _promising, _try_formulas
 from rig.diagnosis.search.pool import Pool
+from rig.diagnosis.search.score_test import ModelChange
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.test_derivatives import model_with
 
@@ -49,6 +51,26 @@ def test_at_the_floor_and_far_above_it_no_formula_is_tried(noise_m):
     fitted = set(pool.fits)
     _try_formulas(pool)
     assert set(pool.fits) == fitted
+
+
+def test_a_change_that_a_fit_has_surpassed_is_not_fitted():
+    """The second two changes promise three and five times what the first one reaches."""
+    pool = pool_of(noise_m=1e-5)
+    rows = pool.linear.fit.rows
+    laws = {
+        "power_damping": ([COEFFICIENT, EXPONENT], 1.0),
+        "quadratic_damping": ([COEFFICIENT], 1.0),
+        "cubic_stiffness": ([1.0], 3.0),
+        "quadratic_stiffness": ([1.0], 5.0),
+    }
+    changes = [
+        ModelChange(model_with(pool.problem, {(0, name): np.array(values)}, {}), cost, cost)
+        for name, (values, times) in laws.items()
+        for cost in [times * rows]
+    ]
+    pool.attempt_changes(changes, no_progress)
+    fitted = {name for candidate in pool.fits for _, name in candidate.new}
+    assert fitted == set(laws) - {"quadratic_stiffness"}
 
 
 def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():

@@ -8,11 +8,13 @@ import pytest
 
 from dart_model.effects import effect
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.build import build
-from rig.diagnosis.problem.problem import nominal
+from rig.diagnosis.problem.problem import free_linear, nominal, strut_constants
+from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
-from rig.diagnosis.search.fit import law_values, model_for
+from rig.diagnosis.search.fit import fit, law_values, model_for, project_out_fit
 from rig.diagnosis.search.pool import FULL, Pool
 from rig.diagnosis.search.score_test import find_changes
 from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law, rank_laws
@@ -135,6 +137,49 @@ def test_a_formula_that_is_nowhere_like_that_of_the_model_is_no_change_of_it():
     others = {name for laws in exchanges for _, name in laws}
     assert {"stribeck_friction", "power_stiffness"} <= others
     assert {"quadratic_stiffness", "plateau_stiffness"}.isdisjoint(others)
+
+
+def strut_force_n(pool, model):
+    """Force of the whole strut along the motion, shape (N,), and linear forces (N, 3)."""
+    (_, track), *_ = pool.along
+    constants = strut_constants(pool.problem, model.parts.linear)
+    ((free_m, stiffness, damping, _, preload_n),) = constants
+    z, v = track.heights_m[0], track.velocities_m_per_s[0]
+    force_n = preload_n - stiffness * (z - free_m) - damping * v
+    for _, law_n in forces_along(pool.problem, model, [(0, track)]):
+        force_n = force_n + law_n
+    return force_n, np.column_stack([np.ones_like(z), z - z.mean(), v])
+
+
+def test_another_formula_begins_beside_the_linear_part_that_makes_up_for_its_linear_force():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3], cubic_stiffness=[1e5])
+    before_n, linear_n = strut_force_n(pool, fitted.model)
+    springs = [
+        change
+        for change in changes_of(pool, fitted)
+        if len(change.laws) == 2 and (0, "cubic_stiffness") not in change.laws
+    ]
+    assert springs
+    for change in springs:
+        begun_n, _ = strut_force_n(pool, change.model)
+        linear = np.linalg.lstsq(linear_n, begun_n - before_n, rcond=None)[0] * linear_n
+        assert np.linalg.norm(linear, axis=0).max() < 1e-3 * np.linalg.norm(before_n)
+
+
+def test_what_a_linearisation_misses_of_a_model_it_misses_of_its_changes():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    at = {(0, "coulomb_friction"): np.array([3.0, 1e-3])}
+    candidate = nominal(pool.problem).with_effects(*at)
+    begun = model_for(pool.problem, pool.linear.fit.model, candidate, at)
+    ended_early = fit(pool.problem, begun, free_linear(pool.problem, candidate), Effort(0))
+    shown = project_out_fit(ended_early)[1]
+    missed = ended_early.solution.cost / float(shown @ shown)
+    assert missed > 2.0
+    for change in changes_of(pool, ended_early):
+        assert change.missed == pytest.approx(missed)
+        assert change.missed * change.unchanged == pytest.approx(ended_early.solution.cost)
+        assert change.cost <= change.begin * (1.0 + 1e-9)
 
 
 def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
