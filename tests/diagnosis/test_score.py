@@ -24,8 +24,8 @@ from tests.diagnosis.test_planted_effects import FrictionAndHardening, FrictionA
 from tests.diagnosis.test_prescribed import Orifice
 
 
-def pool_of(bench, force):
-    problem = build(bench.model(), [bench.run(force)], CRITERIA.blocks, None)
+def pool_of(bench, force, **kwargs):
+    problem = build(bench.model(), [bench.run(force, **kwargs)], CRITERIA.blocks, None)
     given, linear = first_fits(problem)
     return Pool(problem, given, [linear], CRITERIA)
 
@@ -152,7 +152,8 @@ def strut_force_n(pool, model):
 
 
 def test_another_formula_begins_beside_the_linear_part_that_makes_up_for_its_linear_force():
-    pool = pool_of(little_bench, FrictionAndHardening())
+    """The noise is so large that other springs than the right one are alike, too."""
+    pool = pool_of(little_bench, FrictionAndHardening(), noise_m=1e-3)
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3], cubic_stiffness=[1e5])
     before_n, linear_n = strut_force_n(pool, fitted.model)
     springs = [
@@ -160,7 +161,7 @@ def test_another_formula_begins_beside_the_linear_part_that_makes_up_for_its_lin
         for change in changes_of(pool, fitted)
         if len(change.laws) == 2 and (0, "cubic_stiffness") not in change.laws
     ]
-    assert springs
+    assert len(springs) > 2
     for change in springs:
         begun_n, _ = strut_force_n(pool, change.model)
         linear = np.linalg.lstsq(linear_n, begun_n - before_n, rcond=None)[0] * linear_n
