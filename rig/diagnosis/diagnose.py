@@ -247,15 +247,14 @@ def _fit_to_all(
     criteria, (given, linear) = searched.criteria, fits
     pool = Pool(problem, given, [linear], criteria)
     found = searched.chosen(criteria.most_laws).fit
-    pool.adopt(found)
+    pool.adopt([found])
     # In the pieces a law may have come to rest where it is a simpler one, or beside its optimum.
     pool.screen_and_attempt(found.candidate.new)
     first = pool.chosen(criteria.most_laws).fit
     problem = _with_residual_noise(problem, first)
     pool = Pool(problem, given, [linear, first], criteria)
-    for i, model in enumerate(models := searched.best_and_subsets()):
-        progress("fitting all of the recordings", 0.5 * i / len(models))
-        pool.adopt(model.fit)
+    models = [model.fit for model in searched.best_and_subsets()]
+    pool.adopt(models, within(progress, 0.0, 0.5))
     pool.converge_best()
     if not pool.is_formula(pool.least()):
         search_about_models(pool, within(progress, 0.5, 1.0))

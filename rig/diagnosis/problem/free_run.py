@@ -495,10 +495,7 @@ class FreeRunProblem(Problem):
             reference = np.nanmean(heights, axis=0)
             if motion is not None:
                 reference = self._seen(k, model, motion)
-            residual = heights - reference
-            variances.append(
-                np.array([estimate_noise(run.grid.t_s, column).variance for column in residual.T])
-            )
+            variances.append(_noise_variance(run.grid.t_s, heights - reference))
         noise = np.minimum(np.sqrt(np.median(variances, axis=0)), self.noise_m)
         return replace(self, noise_m=np.maximum(noise, 1e-300))
 
@@ -827,9 +824,9 @@ class FreeRunProblem(Problem):
         ]
         shares = [known_share(grid.t_s, self._delays(model).struts) for model in models]
         measured = np.where(np.min(shares, axis=0) == 1.0, measured, np.nan)
-        noise = np.sqrt(
-            [estimate_noise(grid.t_s, c).variance for c in (grid.heights_m - seen_m[2]).T]
-        )
+        # Of a model's error a part looks like noise: the smallest estimate is nearest.
+        residuals_m = [grid.heights_m - heights_m for heights_m in seen_m]
+        noise = np.sqrt(np.min([_noise_variance(grid.t_s, r) for r in residuals_m], axis=0))
         on_dart_m: list[Array] = []
         coarser = self.coarser(models.linear)
         for model, motion, heights_m in (
@@ -1017,6 +1014,11 @@ def _whole_motions(
         heights_m=reference.heights_m + z, velocities_m_per_s=reference.velocities_m_per_s + w
     )
     return measured, reference
+
+
+def _noise_variance(t_s: Array, residual_m: Array) -> Array:
+    """Variance of the noise in residual heights (N, struts), shape (struts,)."""
+    return np.array([estimate_noise(t_s, column).variance for column in residual_m.T])
 
 
 def _spline_through(nodes_s: Array, values: Array, t_s: Array) -> Array:

@@ -56,7 +56,7 @@ def _weigh(
     subsets = [m for m in pool.fits.values() if set(m.fit.candidate.new) <= kept]
     earlier = _nearest_rival(first, chosen, law)
     if earlier is not None and earlier.fit.candidate not in pool.fits:
-        pool.adopt(earlier.fit)
+        pool.adopt([earlier.fit])
     elif earlier is None and chosen.size == 1:
         others = (at for at in single if _family(at) != _family(law))
         if (next_best := next(others, None)) is not None:

@@ -264,7 +264,9 @@ class Pool:
                         self.converged.add(candidate)
                     if model is not None:
                         self._keep(candidate, model)
-        self._leave_out_weakest([candidate for candidate, _ in jobs], effort)
+        candidates = [candidate for candidate, _ in jobs]
+        self._converge_promising(candidates)
+        self._leave_out_weakest(candidates, effort)
 
     def _least_cost(self) -> float:
         """The least sum of squares of a valid model, infinite where there is none."""
@@ -280,6 +282,30 @@ class Pool:
             return None
         result = self._fit_from(begin, effort, least)
         return None if result is None else self.validate(result)
+
+    def _converge_promising(self, candidates: Sequence[Candidate]) -> None:
+        """Converge models that leave much less than the valid ones, but do not count as best.
+
+        A rough fit may have ended on its way: its defect is then that of where it ended, and so is
+        its error on blocks left out, which is linearised there.
+        """
+        for candidate in dict.fromkeys(candidates):
+            model = self.fits.get(candidate)
+            if model is None or not model.size or candidate in self.converged:
+                continue
+            is_best = candidate not in self.invalid and model is self.least()
+            if not is_best and self._leaves_much_less(candidate):
+                self.attempt(model.fit.model, FULL)
+
+    def _leaves_much_less(self, candidate: Candidate) -> bool:
+        """Whether a fit leaves less than every valid other one by what a law has to gain."""
+        valid = [it for it in self.valid() if it.fit.candidate != candidate]
+        if not valid:
+            return False
+        least = min(it.fit.solution.cost for it in valid)
+        enough = self.criteria.least_share * (least - valid[0].fit.rows)
+        gain = least - self.fits[candidate].fit.solution.cost
+        return gain > max(self.criteria.least_likelihood_gain, enough)
 
     def _leave_out_weakest(self, candidates: Sequence[Candidate], effort: Effort) -> None:
         """Fit models that are better than all valid ones, but invalid, without their weakest law.
@@ -447,10 +473,14 @@ class Pool:
         model = self._fit_starts(candidate, self.linear_of_file, np.concatenate(values))
         self._fit_each([(candidate, partial(Begin, model, promised=promised))], FULL, no_progress)
 
-    def adopt(self, result: Fit) -> None:
-        """Fit the laws of a model of other recordings, starting from its parameters."""
-        parts = result.parts
-        self.attempt(self._fit_starts(result.candidate, parts.linear, parts.effects))
+    def adopt(self, results: Sequence[Fit], progress: Progress = no_progress) -> None:
+        """Fit the laws of models of other recordings, starting from their parameters."""
+
+        def begin_at(candidate: Candidate, parts: Parts) -> Begin:
+            return Begin(self._fit_starts(candidate, parts.linear, parts.effects))
+
+        jobs = [(it.candidate, partial(begin_at, it.candidate, it.parts)) for it in results]
+        self._fit_each(jobs, ROUGH, progress)
 
     def screen_and_attempt(self, laws: Sequence[StrutEffect]) -> None:
         """Fit laws in simulation from where the regression along the motion puts them."""

@@ -73,7 +73,7 @@ def _fitted_in(pool: Pool, first: Pool, chosen: ValidatedModel, law: StrutEffect
     model = first.fits[candidate]
     if candidate in first.invalid or residual_left(first, model) > residual_left(pool, chosen):
         return first
-    pool.adopt(model.fit)
+    pool.adopt([model.fit])
     return pool if candidate in pool.fits else first
 
 
