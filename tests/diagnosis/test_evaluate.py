@@ -14,13 +14,16 @@ from typer.testing import CliRunner
 from can_dbc.errors import InputError
 from dart_model.spec import dump_model
 from rig.cli.main import app
-from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.diagnose import diagnose, first_fits
 from rig.diagnosis.evaluate import evaluate_model
+from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.problem.problem import ComparedModels
 from rig.recordings.gaps import are_timed, find_gaps
 from rig.recordings.read import read_recording
 from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.driven import driven_by
+from tests.diagnosis.test_derivatives import model_with
 
 HEAVY = 1.1 * little_bench.MASS
 FORCE_NOISE_N = 1.0
@@ -34,6 +37,20 @@ def test_a_right_model_is_at_the_noise_floor_and_a_wrong_one_is_not():
     assert right.figures.height_rmse_m.after < 1.2 * floor_m
     assert right.figures.height_rmse_m.before == right.figures.height_rmse_m.after
     assert wrong.figures.height_rmse_m.after > 20.0 * floor_m
+
+
+def test_what_a_wrong_model_errs_by_is_no_noise_beside_a_better_one():
+    """The tone at 30 Hz that the bench lacks is too fast for a smooth residual."""
+    run = little_bench.run(little_bench.Nothing(), seed=3)
+    problem = build_without_delays(little_bench.model(), [run], 32, None)
+    right = first_fits(problem)[0].model
+    wrong = model_with(problem, {(0, "periodic_force"): np.array([3.0, 30.0, 0.0])}, {})
+
+    def floor_m(*models):
+        return problem.evaluate(0, ComparedModels(*models), 0.0, blocks=False).floor.height_rmse_m
+
+    assert floor_m(wrong, wrong, wrong) > 1.05 * floor_m(right, right, right)
+    assert floor_m(right, right, wrong) < 1.01 * floor_m(right, right, right)
 
 
 @pytest.mark.slow

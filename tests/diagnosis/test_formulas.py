@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.progress import no_progress
+from rig.diagnosis.search import pool as pool_module
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.explore import _promising, _try_formulas
 from rig.diagnosis.search.pool import Pool
@@ -71,6 +73,24 @@ def test_a_change_that_a_fit_has_surpassed_is_not_fitted():
     pool.attempt_changes(changes, no_progress)
     fitted = {name for candidate in pool.fits for _, name in candidate.new}
     assert fitted == set(laws) - {"quadratic_stiffness"}
+
+
+def test_a_rough_fit_that_leaves_least_is_converged_before_it_is_judged(monkeypatch):
+    """Where it ends after a single step it has a defect."""
+    monkeypatch.setattr(pool_module, "ROUGH", Effort(1, 1e-3, 1))
+    law = (0, "power_damping")
+
+    monkeypatch.setattr(
+        pool_module,
+        "find_defect",
+        lambda _, it, *__: "far" if law in it.candidate.new and it.mean_square > 1.3 else None,
+    )
+    pool = pool_of(noise_m=1e-5)
+    begun = model_with(pool.problem, {law: np.array([COEFFICIENT, 1.9])}, {})
+    pool.attempt(begun, pool_module.ROUGH)
+    assert begun.candidate not in pool.invalid
+    assert begun.candidate in pool.converged
+    assert pool.least().fit.mean_square < 1.3
 
 
 def test_what_promises_as_much_as_the_best_further_law_is_fitted_too():
