@@ -137,8 +137,7 @@ CASES = {
     "most_left": _case(
         "not_explained", (), _on_dyno, _HARDENING, Sum(_HARDENING, Cogging(40.0))
     ),
-    # What dissipates of it is described in part.
-    "driven": _case("partly_explained", ["nonlinear_damping"], _on_dyno, Driven()),
+    "driven": _case("not_explained", (), _on_dyno, Driven()),
     # Dissipates at the recorded velocities alone.
     "driven_if_faster": _case(
         "partly_explained", ["nonlinear_damping"], _on_dyno, Regressive()

@@ -256,7 +256,10 @@ class Pool:
                 names = ", ".join(name for _, name in jobs[i][0].new) or "the linear part"
                 progress(f"fitting {names}", i / len(jobs))
                 some = jobs[i : i + _AT_ONCE]
-                fit_one = partial(self._fit_one, effort, self._least_cost())
+                least = self._least_cost()
+                # The first of them were chosen with what there is in mind.
+                most = _SURPASSED * least if i else np.inf
+                fit_one = partial(self._fit_one, effort, least, most)
                 for (candidate, _), model in zip(
                     some, threads.map(fit_one, [begin for _, begin in some]), strict=True
                 ):
@@ -273,12 +276,12 @@ class Pool:
         return min((model.fit.solution.cost for model in self.valid()), default=np.inf)
 
     def _fit_one(
-        self, effort: Effort, least: float, begin_at: Callable[[], Begin]
+        self, effort: Effort, least: float, most: float, begin_at: Callable[[], Begin]
     ) -> ValidatedModel | None:
-        """Fit a candidate; None where it has no fit, or promises `_SURPASSED` times the least."""
+        """Fit a candidate; None where it has no fit, or promises no less than `most`."""
         begin = begin_at()
         is_known = math.isfinite(begin.promised)
-        if is_known and begin.promised * self.linear.fit.rows > _SURPASSED * least:
+        if is_known and begin.promised * self.linear.fit.rows > most:
             return None
         result = self._fit_from(begin, effort, least)
         return None if result is None else self.validate(result)
