@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dart_model.effects import effect
+from dart_model.spec import MODELS, load_model
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.build import build
@@ -16,12 +17,22 @@ from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.damper_with_friction import screen_damper_with_friction
 from rig.diagnosis.search.fit import fit, law_values, model_for, project_out_fit
 from rig.diagnosis.search.pool import FULL, Pool
-from rig.diagnosis.search.score_test import find_changes
+from rig.diagnosis.search.score_test import (
+    _Base,
+    _remove_law_force,
+    _replace_law,
+    find_changes,
+)
 from rig.diagnosis.search.screen import is_compatible, linear_changes, no_law, rank_laws
+from rig.recordings.read import read_recording
 from tests.criteria_study.cases import Regressive
 from tests.diagnosis import little_bench, little_dyno
+from tests.diagnosis.mechanisms import QuarterCarWithFriction
 from tests.diagnosis.test_planted_effects import FrictionAndHardening, FrictionAndValves
 from tests.diagnosis.test_prescribed import Orifice
+
+OF_FORCE = ("stiffness", "damping", "preload")
+"""Linear parameters that are forces of a strut."""
 
 
 def pool_of(bench, force, **kwargs):
@@ -166,6 +177,32 @@ def test_another_formula_begins_beside_the_linear_part_that_makes_up_for_its_lin
         begun_n, _ = strut_force_n(pool, change.model)
         linear = np.linalg.lstsq(linear_n, begun_n - before_n, rcond=None)[0] * linear_n
         assert np.linalg.norm(linear, axis=0).max() < 1e-3 * np.linalg.norm(before_n)
+
+
+@pytest.mark.parametrize("strut", [0, 1])
+def test_another_formula_changes_the_linear_part_of_its_own_strut_alone(strut, tmp_path):
+    car, spec = QuarterCarWithFriction(), load_model(MODELS / "quarter_car.yaml")
+    run = read_recording(car.csv(tmp_path / "run.csv"), [item.name for item in spec.struts])
+    problem = build(spec, [run], CRITERIA.blocks, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    at = {(strut, "coulomb_friction"): np.array([20.0, 1e-3])}
+    candidate = nominal(problem).with_effects(*at)
+    begun = model_for(problem, pool.linear.fit.model, candidate, at)
+    fitted = fit(problem, begun, free_linear(problem, candidate), Effort(3))
+    own = np.array([p.strut == strut and p.kind in OF_FORCE for p in problem.linear])
+    assert own.sum() == len(OF_FORCE)
+    tracks = tuple(track for _, track in pool.along)
+    base = _Base(
+        problem, fitted, tracks, strut_constants(problem, fitted.parts.linear),
+        *project_out_fit(fitted), (problem, fitted.residual),
+    )  # fmt: skip
+    old = _remove_law_force(base, (strut, "coulomb_friction"))
+    other = (strut, "stribeck_friction")
+    begun = _replace_law(base, other, np.array([30.0, 1.5, 0.1, 1e-3]), old)
+    moved = begun.parts.linear - fitted.parts.linear
+    assert np.all(moved[~own] == 0.0)
+    assert np.any(moved[own] != 0.0)
 
 
 def test_what_a_linearisation_misses_of_a_model_it_misses_of_its_changes():

@@ -28,8 +28,8 @@ class SelectionCriteria:
             recordings).
         fitted_a_size: Combinations of each size that are fitted in simulation, apart from subsets
             of theirs; of the changes of a fitted model so many additions, with two exchanges of
-            each law, and those of the same families that promise as much as the best (additions
-            only if that is what a law has to gain).
+            each law, and those of the same families that promise as much as the best (additions,
+            if that is what a law has to gain) or begin as near to the model (exchanges).
         hopeless: Times the sum of squares of the best combination of a size, along the motion, from
             which on a combination of that size is not fitted in simulation, and a fitted model not
             near the best: smoothing the motion costs laws that switch a factor of two at most.

@@ -180,7 +180,7 @@ def _try_formulas(pool: Pool) -> None:
         exchanges = [it for it in pool.changes(best) if len(it.laws) == len(laws)]
         promising = [it for it in exchanges if it.cost < _MUCH * best.cost]
         pool.attempt_changes(promising, no_progress)
-        if pool.least() is best:
+        if not pool.gains_share(pool.least(), best):
             pool.attempt_changes(exchanges, no_progress)
         if not pool.gains_share(pool.least(), best):
             return
@@ -312,7 +312,10 @@ def _promising(
 
 
 def _ties(change: ModelChange, best: ModelChange) -> bool:
-    """Whether a change promises as much as the best one, with laws of the same families."""
+    """Whether a change is as good as the best one where it begins, its laws of the same families.
+
+    Additions begin at what they promise, exchanges at what leads there.
+    """
     return change.begin < _TIE * best.begin and _families(change.laws) == _families(best.laws)
 
 

@@ -90,8 +90,8 @@ model leaves: a fit that comes nowhere near is in another valley."""
 _AT_ONCE = 2
 """Fits that go on at a time, the same on every machine: what they reach decides which follow."""
 _SURPASSED = 4.0
-"""Times the least sum of squares from which on a promise is too little: what it was compared with
-has been surpassed by fits before."""
+"""Times the least sum of squares of a valid model from which on a promise is too little. The first
+of a batch are fitted whatever they promise: they were chosen beside what there was."""
 _STUCK = 2.0
 """Ratio of a converged fit's sum of squares to that of its linearisation from which on it is
 stuck: right models end at 1, beside dry friction at 1.2."""
@@ -152,6 +152,14 @@ class Begin(NamedTuple):
         candidate, parts = self.model
         arrays = parts.linear, parts.effects, *parts.starts
         return candidate, self.most_level, self.promised, tuple(it.tobytes() for it in arrays)
+
+
+class _Job(NamedTuple):
+    """A fit to be done: its candidate, where it begins, and what it promises, as in `Begin`."""
+
+    candidate: Candidate
+    begin_at: Callable[[], Begin]
+    promised: float = np.inf
 
 
 class Pool:
@@ -226,48 +234,39 @@ class Pool:
         progress: Progress = no_progress,
     ) -> None:
         """Fit models in simulation, as `attempt` does, some at a time."""
-        jobs = [(model.candidate, partial(Begin, model)) for model in models]
+        jobs = [_Job(model.candidate, partial(Begin, model)) for model in models]
         self._fit_each(jobs, effort, progress)
 
     def attempt_changes(self, changes: Sequence[ModelChange], progress: Progress) -> None:
         """Fit changed models in simulation, some at a time."""
-        rows = self.linear.fit.rows
-        jobs = [
-            (change.model.candidate, partial(Begin, change.model, promised=change.cost / rows))
-            for change in changes
+        begins = [
+            Begin(change.model, promised=change.cost / self.linear.fit.rows) for change in changes
         ]
-        self._fit_each(jobs, ROUGH, progress)
+        self._fit_each([_job_of(begin) for begin in begins], ROUGH, progress)
 
-    def _fit_each(
-        self,
-        jobs: Sequence[tuple[Candidate, Callable[[], Begin]]],
-        effort: Effort,
-        progress: Progress,
-    ) -> None:
+    def _fit_each(self, jobs: Sequence[_Job], effort: Effort, progress: Progress) -> None:
         """Fit candidates from where they begin, and keep each that is better than an earlier fit.
 
-        Begins and fits that go on at once are independent of each other, and take a thread each.
+        Fits that go on at once take a thread each; what is kept of them is kept after all of them.
         """
-        for candidate, _ in jobs:
-            slots_of(self.problem, candidate).compile_slopes()  # Here: numba's compiler admits one.
-
+        for job in jobs:
+            # Compiled here: numba's compiler admits one thread.
+            slots_of(self.problem, job.candidate).compile_slopes()
+        left = list(jobs)
         with ThreadPoolExecutor(_AT_ONCE) as threads:
-            for i in range(0, len(jobs), _AT_ONCE):
-                names = ", ".join(name for _, name in jobs[i][0].new) or "the linear part"
-                progress(f"fitting {names}", i / len(jobs))
-                some = jobs[i : i + _AT_ONCE]
-                least = self._least_cost()
-                # The first of them were chosen with what there is in mind.
-                most = _SURPASSED * least if i else np.inf
-                fit_one = partial(self._fit_one, effort, least, most)
-                for (candidate, _), model in zip(
-                    some, threads.map(fit_one, [begin for _, begin in some]), strict=True
-                ):
+            while left:
+                some, left = left[:_AT_ONCE], left[_AT_ONCE:]
+                laws = ", ".join(name for _, name in some[0].candidate.new)
+                done = 1.0 - (len(some) + len(left)) / len(jobs)
+                progress(f"fitting {laws or 'the linear part'}", done)
+                fit_one = partial(self._fit_one, effort, self._least_cost())
+                for job, model in zip(some, list(threads.map(fit_one, some)), strict=True):
                     if effort is FULL:
-                        self.converged.add(candidate)
+                        self.converged.add(job.candidate)
                     if model is not None:
-                        self._keep(candidate, model)
-        candidates = [candidate for candidate, _ in jobs]
+                        self._keep(job.candidate, model)
+                left = [job for job in left if not self._is_surpassed(job)]
+        candidates = [job.candidate for job in jobs]
         self._converge_promising(candidates)
         self._leave_out_weakest(candidates, effort)
 
@@ -275,16 +274,15 @@ class Pool:
         """The least sum of squares of a valid model, infinite where there is none."""
         return min((model.fit.solution.cost for model in self.valid()), default=np.inf)
 
-    def _fit_one(
-        self, effort: Effort, least: float, most: float, begin_at: Callable[[], Begin]
-    ) -> ValidatedModel | None:
-        """Fit a candidate; None where it has no fit, or promises no less than `most`."""
-        begin = begin_at()
-        is_known = math.isfinite(begin.promised)
-        if is_known and begin.promised * self.linear.fit.rows > most:
-            return None
-        result = self._fit_from(begin, effort, least)
+    def _fit_one(self, effort: Effort, least: float, job: _Job) -> ValidatedModel | None:
+        result = self._fit_from(job.begin_at(), effort, least)
         return None if result is None else self.validate(result)
+
+    def _is_surpassed(self, job: _Job) -> bool:
+        """Whether a fit promises more than some times what the best valid model leaves."""
+        is_known = math.isfinite(job.promised)
+        most = _SURPASSED * self._least_cost()
+        return is_known and job.promised * self.linear.fit.rows > most
 
     def _converge_promising(self, candidates: Sequence[Candidate]) -> None:
         """Converge models that leave much less than the valid ones, but do not count as best.
@@ -323,7 +321,8 @@ class Pool:
                 sizes = size_in_deviations(self.problem, model.fit)
                 if sizes:
                     smaller = candidate.without(min(sizes, key=sizes.__getitem__))
-                    self.attempt(model_for(self.problem, model.fit.model, smaller), effort)
+                    if smaller not in self.converged:
+                        self.attempt(model_for(self.problem, model.fit.model, smaller), effort)
 
     def _fit_from(self, begin: Begin, effort: Effort, least: float) -> Fit | None:
         """Fit a model; where its linear part ends far from the file's, once more from there.
@@ -390,17 +389,24 @@ class Pool:
         is_stuck = effort is FULL and result is not None and _is_stuck(result, least)
         if not (parted or missed or (is_stuck and begin.model.candidate not in self.stuck)):
             return result
-        if not self.held:
-            return result
-        for problem in self.held:
-            held = self._refit(problem, begin, ROUGH)
-            if held is not None and held.mean_square > _MISSED * begin.promised:
-                return result
-            begin = begin if held is None else begin._replace(model=held.model)
-        other = self._refit(self.problem, begin, effort)
+        other = self._let_go(begin, effort)
         if is_stuck and (other is None or other.mean_square > reached / _STUCK):
             self.stuck.add(begin.model.candidate)
         return result if other is None or reached < other.mean_square else other
+
+    def _let_go(self, begin: Begin, effort: Effort) -> Fit | None:
+        """Fit a model that is held to the measured motion, less and less, and then free.
+
+        None where it cannot be held, or is not near its promise even there.
+        """
+        if not self.held:
+            return None
+        for problem in self.held:
+            held = self._refit(problem, begin, ROUGH)
+            if held is not None and held.mean_square > _MISSED * begin.promised:
+                return None
+            begin = begin if held is None else begin._replace(model=held.model)
+        return self._refit(self.problem, begin, effort)
 
     def _keep(self, candidate: Candidate, model: ValidatedModel) -> None:
         if candidate in self.fits and model.cost >= self.fits[candidate].cost:
@@ -429,8 +435,12 @@ class Pool:
         """Fit the laws of screenings, as `attempt_screening` does, some at a time."""
         base = nominal(self.problem)
         jobs = [
-            (base.with_effects(*it.laws), partial(self._begin_at, stage, reference, it))
-            for it in screenings
+            _Job(
+                base.with_effects(*screening.laws),
+                partial(self._begin_at, stage, reference, screening),
+                _promised_level(stage, screening),
+            )
+            for screening in screenings
         ]
         self._fit_each(jobs, effort, progress)
 
@@ -454,7 +464,7 @@ class Pool:
         linear = np.clip(linear, least, most)
         model = self._fit_starts(candidate, linear, np.concatenate(values))
         # Priors weigh as in the regression: a free run may begin far off with right parameters.
-        level = max(1.0, screening.cost / len(stage.target))
+        level = _promised_level(stage, screening)
         return Begin(model, level, level)
 
     def _fit_starts(self, candidate: Candidate, linear: Array, effects: Array) -> CandidateModel:
@@ -474,7 +484,7 @@ class Pool:
         values = [existing_values(self.problem, nominal(self.problem))]
         values += [laws[law] for law in candidate.new]
         model = self._fit_starts(candidate, self.linear_of_file, np.concatenate(values))
-        self._fit_each([(candidate, partial(Begin, model, promised=promised))], FULL, no_progress)
+        self._fit_each([_job_of(Begin(model, promised=promised))], FULL, no_progress)
 
     def adopt(self, results: Sequence[Fit], progress: Progress = no_progress) -> None:
         """Fit the laws of models of other recordings, starting from their parameters."""
@@ -482,7 +492,7 @@ class Pool:
         def begin_at(candidate: Candidate, parts: Parts) -> Begin:
             return Begin(self._fit_starts(candidate, parts.linear, parts.effects))
 
-        jobs = [(it.candidate, partial(begin_at, it.candidate, it.parts)) for it in results]
+        jobs = [_Job(it.candidate, partial(begin_at, it.candidate, it.parts)) for it in results]
         self._fit_each(jobs, ROUGH, progress)
 
     def screen_and_attempt(self, laws: Sequence[StrutEffect]) -> None:
@@ -674,6 +684,16 @@ class Pool:
     def is_rival(self, other: ValidatedModel, best: ValidatedModel) -> bool:
         """Whether the data cannot distinguish a model from the best one."""
         return error_ratio(other, best, self.criteria.level).low <= 1.0
+
+
+def _job_of(begin: Begin) -> _Job:
+    """A fit whose begin is known."""
+    return _Job(begin.model.candidate, lambda: begin, begin.promised)
+
+
+def _promised_level(stage: Stage, screening: Screening) -> float:
+    """Mean square of the residual that a screening promises, at least that of noise."""
+    return max(1.0, screening.cost / len(stage.target))
 
 
 def _is_stuck(result: Fit, least: float) -> bool:

@@ -280,9 +280,12 @@ def _replace_law(base: _Base, at: StrutEffect, values: Array, old: _ReplacedLaw)
     candidate = fitted.candidate.without(old.law).with_effects(at)
     model = model_for(problem, fitted, candidate, {at: values})
     forces_n = _linear_part_forces(base, at[0])
-    size = np.maximum(np.linalg.norm(forces_n, axis=0), _TINY)
+    size = np.linalg.norm(forces_n, axis=0)
+    acting = size > 0.0
     lacking_n = old.force_n - _forces(base, at, values)
-    changes = np.linalg.lstsq(forces_n / size, lacking_n, rcond=_RANK)[0] / size
+    columns = forces_n[:, acting] / size[acting]
+    changes = np.zeros(len(size))
+    changes[acting] = np.linalg.lstsq(columns, lacking_n, rcond=_RANK)[0] / size[acting]
     low, high = np.array([linear_bounds(p, candidate) for p in problem.linear]).reshape(-1, 2).T
     return model.with_linear(np.clip(fitted.parts.linear + changes, low, high))
 
