@@ -117,7 +117,7 @@ def _check_recordings(
             print_table(("", ""), rows, title)
         heads = ("parameter", "strut", "nominal", "known to", "model file", "varies with")
         print_table(heads, texts.linear(found), "Linear part, standard deviations")
-        heads = ("family", "strut", "found from", "of the force", "least unlike", "told from")
+        heads = ("family", "strut", "found from", "of the force", "nearest family", "named from")
         print_table(heads, texts.families(found), "Laws, RMS of their force")
         for text in warnings:
             print_text(f"- {text}", "yellow")

@@ -81,7 +81,7 @@ def _print_channels(diagnosis: "Diagnosis") -> None:
 
 def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
     from rig.pages.report.tables import effects, existing
-    from rig.pages.report.words import evidence_words, missing
+    from rig.pages.report.words import acting_words, evidence_words, missing
 
     laws, changed = effects(diagnosis), existing(diagnosis)
     if laws:
@@ -94,6 +94,8 @@ def _print_effects(diagnosis: "Diagnosis", *, struts: int) -> None:
         for found in missing(diagnosis):
             if found.evidence is not None:
                 print_text(f"- {found.name}: {evidence_words(found.evidence, diagnosis.level)}.")
+            if found.where is not None:
+                print_text(f"- {found.name}: {acting_words(found.where)}.")
     for law, note, parameters in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in parameters]
         print_text(f"- {law.name}, {'; '.join((note, *values))}")

@@ -16,6 +16,7 @@ _ONE_WAY = 0.05
 _ONE_FREQUENCY = 1.3
 """Ratio of the ends of a band below which it is one frequency."""
 _UNITS = {"delay_s": "s", "gain": ""}
+_CHANNELS = {"delay_s": "delay", "gain": "gain of the height"}
 
 
 def recordings(found: Determinable) -> tuple[tuple[str, tuple[Row, ...]], ...]:
@@ -106,19 +107,28 @@ def _of_recording(it: RecordingFacts) -> list[str]:
 
 
 def _of_parameter(it: LinearBound) -> str:
-    where = f"{it.parameter} of strut {it.strut}"
+    where = f"{capital(_words(it.parameter))} of strut {it.strut}"
     if it.is_determined:
-        return f"{where} is hardly told from {it.alike}: only their combination is determined."
+        return (
+            f"{where} is hardly distinguished from {_words(it.alike)}: only their combination is "
+            "determined."
+        )
     return (
         f"{where} is not determined: the model file's value decides. State its tolerance, or "
         "record a motion with higher frequencies and a larger stroke."
     )
 
 
+def _words(parameter: str | None) -> str:
+    """A parameter in words, as “the mass”."""
+    return "the " + _CHANNELS.get(parameter or "", LINEAR.get(parameter or "", ("", ""))[0])
+
+
 def _of_family(it: FamilyBound) -> str:
     name = capital(FAMILY_WORDS[it.family])
     if it.apart_n > 2.0 * it.least_n and it.rival is not None:
-        what = f"is told from {FAMILY_WORDS[it.rival]} only from {quantity(it.apart_n, 'N')} RMS on"
+        least = quantity(it.apart_n, "N")
+        what = f"is distinguished from {FAMILY_WORDS[it.rival]} only from {least} RMS on"
     else:
         what = f"is found only from {quantity(it.least_n, 'N')} RMS on"
     return f"{name} of strut {it.strut} {what}. Record {it.excitation}."

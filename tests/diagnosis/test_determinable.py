@@ -101,7 +101,7 @@ def test_one_frequency_leaves_linear_parameters_alike():
     )
     found = find_determinable(still, [once])
     text = " ".join(warnings(found))
-    assert "hardly told from" in text or "not determined" in text
+    assert "hardly distinguished from" in text or "not determined" in text
 
 
 class Friction(bench.Nothing):
@@ -147,7 +147,7 @@ def test_the_command_states_it_and_refuses_what_it_cannot_read(monkeypatch, tmp_
     assert {row["parameter"] for row in told["linear"]} >= {"mass_kg", "stiffness_n_per_m"}
     assert {row["family"] for row in told["families"]} >= {"friction"}
     assert rig(monkeypatch, "check", path, "--model", model) == 0
-    assert "told from" in capsys.readouterr().out
+    assert "named from" in capsys.readouterr().out
     assert rig(monkeypatch, "check", path) == 2
     assert "is a recording" in capsys.readouterr().err
     assert rig(monkeypatch, "check", model, model) == 2

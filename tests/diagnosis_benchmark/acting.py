@@ -1,6 +1,10 @@
-"""Where an effect shows, held against where it was planted: stops by height, knees by speed."""
+"""Where an effect shows, held against where it was planted.
+
+Stops and end zones by height, knees by speed.
+"""
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 from tests.truth.plant import Case
@@ -20,6 +24,9 @@ def overlaps(case: Case, diagnosis: dict) -> Iterator[float]:
             continue
         if planted.family == "stop":
             outside = truth["low_m"], truth["high_m"]
+            yield overlap(where["height_m"], outside, where["recorded_height_m"])
+        elif planted.law == "taper":
+            outside = case.bench.free_length_m, math.inf
             yield overlap(where["height_m"], outside, where["recorded_height_m"])
         elif planted.law == "blow_off":
             slow = -truth["knee_m_per_s"], truth["knee_m_per_s"]

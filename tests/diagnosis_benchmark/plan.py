@@ -61,7 +61,12 @@ GROUPS = {
     "moving": Group(45, moving.KINDS[:2], "one to three effects, base moved, rough nominal model"),
     "posts": Group(15, moving.KINDS[2:], "the same in a car on four posts"),
     "faint": Group(0, FAMILIES, "one effect below five times the floor"),
-    "stops": Group(0, ("stop", "rough_stop"), "a stop, half rough: where it shows"),
+    "stops": Group(40, ("stop", "rough_stop"), "a stop, half rough: where it shows"),
+    "disturbed": Group(
+        0,
+        ("disturbed", "rough_disturbed", "dyno_disturbed"),
+        "nothing but coloured noise and a late height",
+    ),
 }
 
 

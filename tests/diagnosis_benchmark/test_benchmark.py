@@ -292,10 +292,10 @@ def test_slots_are_as_many_as_asked_and_cover_every_family():
 
 def test_defaults_and_a_part_of_them():
     counts = {name: group.cases for name, group in GROUPS.items()}
-    assert 450 <= sum(counts.values()) <= 550
+    assert 450 <= sum(counts.values()) <= 600
     assert part_of(counts, 1) == counts
     part = part_of(counts, 10)
-    assert 45 <= sum(part.values()) <= 55
+    assert 45 <= sum(part.values()) <= 60
     assert all(bool(part[name]) == bool(counts[name]) for name in counts)
     kinds = [slot.kind for slot in slots(part, 0) if slot.group == "single"]
     assert len(set(kinds)) == len(kinds)
@@ -448,6 +448,11 @@ def test_a_stop_and_a_knee_are_held_against_where_they_were_planted():
     named = [{"family": it.family, "where": where} for it in case.effects]
     assert list(overlaps(case, {"effects": named})) == pytest.approx([1.0, 1.0])
     assert list(overlaps(case, {"effects": named[:1]})) == pytest.approx([1.0])
+    zone = case_of(Planted("nonlinear_damping", "taper", {"damping_n_s_per_m2": 1.0}))
+    zone = replace(zone, bench=replace(zone.bench, free_length_m=0.35))
+    below = where | {"height_m": [[0.3, 0.35]]}
+    named = [{"family": "nonlinear_damping", "where": below}]
+    assert list(overlaps(zone, {"effects": named})) == pytest.approx([1.0])
     assert not list(overlaps(case, {"effects": []}))
 
 

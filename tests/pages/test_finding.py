@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.diagnosis.outcome import ModelErrors
+from rig.diagnosis.outcome import ModelErrors, RejectedEffect
 from rig.pages.report.finding import find, remainder
 from tests.pages.test_report import FALLS, FRICTION, MASS, SOFTER, found, report
 
@@ -77,6 +77,30 @@ def test_a_load_cell_that_does_not_agree_is_said():
     assert "does not agree" in cell.text
     *_, cell = find(report()).certainty
     assert "No load cell" in cell.text
+
+
+def test_a_height_error_that_falls_is_no_model_as_good_as_any():
+    held_out = replace(
+        found().held_out,
+        height_rmse_m=ModelErrors(0.13, 0.13, 3.5e-3, math.nan),
+        residual_force_rmse_n=ModelErrors(0.43, 0.43, 0.42, math.nan),
+    )
+    text = remainder(replace(found("partly_explained"), held_out=held_out)).text
+    assert "2.7\u00a0% of the height error is left" in text
+    assert "as good as any" not in text
+
+
+def test_a_rival_that_leaves_less_than_what_is_named_is_said_with_the_reason_against_it():
+    def certainty(left):
+        rival = RejectedEffect("hysteresis", "dahl", "strut", "it cancels another law", left)
+        _, rivals, _ = find(report(replace(found(), rejected=(rival,), left=0.1))).certainty
+        return rivals
+
+    behind, ahead = certainty(0.4), certainty(0.05)
+    assert behind.tone == "good"
+    assert "what is named here leaves 10.0" in behind.text
+    assert ahead.tone == "part"
+    assert ahead.text.endswith("It was not chosen: it cancels another law.")
 
 
 def test_a_second_pass_that_gains_nothing_names_the_model_to_keep():

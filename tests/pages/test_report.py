@@ -610,7 +610,7 @@ def test_a_bar_and_a_sentence_show_where_an_effect_acts():
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ((), "at no part of the recorded heights by itself"),
+        ((), "no place of its own over the recorded heights"),
         (((0.35, 0.36), (0.44, 0.45)), "from 350 mm to 360 mm and from 440 mm to 450 mm"),
     ],
 )

@@ -1,7 +1,8 @@
 """Draws whole cases: `make_case(seed, kind)`.
 
 Kinds: ``single`` (families in turn), any family's name, ``pair``, ``triple``, ``complete``,
-``outside``, ``friction_and_cubic``, and ``foreign-FAMILY``: an effect of that family by a formula
+``disturbed`` (complete, but the noise is coloured and the height late), ``outside``,
+``friction_and_cubic``, and ``foreign-FAMILY``: an effect of that family by a formula
 that no catalogue holds.
 
 ``rough_KIND`` is such a case whose model file is rough in all that is linear, so that only what is
@@ -25,7 +26,10 @@ FAMILIES = tuple(DRAWS)
 FOREIGN_KINDS = {f"foreign-{family}": family for family in FOREIGN}
 LINEAR_FAMILIES = ("preload", "stiffness", "damping", "inertia", "input_gain")
 NONLINEAR_FAMILIES = tuple(family for family in FAMILIES if family not in LINEAR_FAMILIES)
-KINDS = ("single", "pair", "triple", "complete", "outside", "friction_and_cubic", *FOREIGN_KINDS)
+KINDS = (
+    *("single", "pair", "triple", "complete", "disturbed", "outside", "friction_and_cubic"),
+    *FOREIGN_KINDS,
+)
 SHAPES = ("multisine", "sweep", "noise")
 LOAD_LIMIT_N = 600.0
 HEIGHT_LOW_M = 0.03
@@ -105,13 +109,14 @@ def _draw_case(rng: Rng, seed: int, kind: str) -> Case:
         held_out = dyno.draw_held_out(rng, train)
     else:
         held_out = _held_out_plan(rng, bench, train)
+    sensors = _sensors(rng, recipe, effects)
     case = Case(
         name=f"{kind}-{seed:04d}-{'+'.join(effect.law for effect in effects) or 'nothing'}",
         kind=kind,
-        families=tuple(effect.family for effect in effects),
+        families=("delay",) if sensors.late_s else tuple(effect.family for effect in effects),
         effects=effects,
         bench=bench,
-        sensors=_sensors(rng, recipe, effects),
+        sensors=sensors,
         train=train,
         held_out=held_out,
         seed=seed,
@@ -135,6 +140,14 @@ def _dyno(rng: Rng, *, centred: bool) -> tuple[Bench, RunPlan, Nominal]:
 
 
 def _sensors(rng: Rng, recipe: _Recipe, effects: tuple[Planted, ...]) -> Sensors:
+    usual = _usual_sensors(rng, recipe, effects)
+    if recipe.base != "disturbed":
+        return usual
+    noise_time_s, late_s = 10.0 ** rng.uniform(-3.3, -2.0), rng.uniform(1e-4, 5e-3)
+    return replace(usual, noise_time_s=float(noise_time_s), late_s=float(late_s))
+
+
+def _usual_sensors(rng: Rng, recipe: _Recipe, effects: tuple[Planted, ...]) -> Sensors:
     warms = any(e.law == "thin_oil" for e in effects)
     if recipe.is_dyno:
         return dyno.draw_sensors(rng, has_temperature=warms or rng.random() < 0.1)
@@ -171,6 +184,7 @@ def _families(rng: Rng, seed: int, recipe: _Recipe) -> tuple[str, ...]:
         return tuple(str(f) for f in rng.choice(families, count, replace=False))
     fixed = {
         "complete": (),
+        "disturbed": (),
         "outside": ("outside",),
         "friction_and_cubic": ("friction", "nonlinear_stiffness"),
     }

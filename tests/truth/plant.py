@@ -136,7 +136,12 @@ class Roughness:
 
 @dataclass(frozen=True)
 class Sensors:
-    """What the bench's electronics make of the truth; a load cell is a dyno's."""
+    """What the bench's electronics make of the truth; a load cell is a dyno's.
+
+    Attributes:
+        noise_time_s: Time constant of the noise of height and load cell; 0: white.
+        late_s: By how much the height is late.
+    """
 
     sample_rate_hz: int
     height_noise_m: float
@@ -145,6 +150,8 @@ class Sensors:
     load_step_n: float = 0.01
     temperature_noise_k: float = 0.05
     has_temperature: bool = False
+    noise_time_s: float = 0.0
+    late_s: float = 0.0
 
     @property
     def height_error_m(self) -> float:

@@ -1,11 +1,22 @@
 """A case becomes two recordings."""
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.signal import lfilter
 
 from tests.truth import compiled
 from tests.truth import excitation as loads
 from tests.truth.integrator import MINIMUM_RATE_HZ, Drive, Motion, follow, integrate
-from tests.truth.plant import Bench, Case, Planted, Recording, RunPlan, Samples, Stroke
+from tests.truth.plant import (
+    Bench,
+    Case,
+    Planted,
+    Recording,
+    RunPlan,
+    Samples,
+    Sensors,
+    Stroke,
+)
 
 BAND_HZ = 25.0
 FINE_LAWS = frozenset({"bristle"})
@@ -123,6 +134,25 @@ def _quantised(values: Samples, step: float) -> Samples:
     return np.round(values / step) * step
 
 
+def _coloured(white: Samples, sensors: Sensors) -> Samples:
+    """Noise of the same variance through a first-order low-pass."""
+    if sensors.noise_time_s <= 0.0:
+        return white
+    kept = np.exp(-1.0 / (sensors.sample_rate_hz * sensors.noise_time_s))
+    fresh = np.sqrt(1.0 - kept**2)
+    begun = fresh * white
+    begun[0] = white[0]
+    return lfilter([1.0], [1.0, -kept], begun)
+
+
+def _late(t_s: Samples, motion: Motion, late_s: float) -> Samples:
+    """Heights as they were some time before."""
+    if late_s == 0.0:
+        return motion.height_m
+    heights = CubicHermiteSpline(t_s, motion.height_m, motion.velocity_m_per_s)
+    return heights(np.maximum(t_s - late_s, t_s[0]))
+
+
 def _temperature_c(
     effects: tuple[Planted, ...], motion: Motion, plan: RunPlan, t_s: Samples
 ) -> Samples:
@@ -142,21 +172,21 @@ def record(case: Case, plan: RunPlan) -> Recording:
     simulated = true_path if case.is_dyno else true_motion
     t_s, motion = simulated(bench, effects, plan, rate_hz, steps_per_sample(effects, rate_hz))
     rng = np.random.default_rng([plan.noise_seed, 6])
-    noise = sensors.height_noise_m * rng.standard_normal(t_s.size)
+    noise = sensors.height_noise_m * _coloured(rng.standard_normal(t_s.size), sensors)
     temperature = load = cell = None
     if sensors.has_temperature:
         wobble = sensors.temperature_noise_k * rng.standard_normal(t_s.size)
         temperature = _temperature_c(effects, motion, plan, t_s) + wobble
     if isinstance(plan.excitation, Stroke):
         cell = strut_force_n(bench, motion)
-        cell += sensors.force_noise_n * rng.standard_normal(t_s.size)
+        cell += sensors.force_noise_n * _coloured(rng.standard_normal(t_s.size), sensors)
         cell = _quantised(cell, sensors.load_step_n)
     else:
         load = loads.load_n(plan.excitation, bench, t_s) / (1.0 + case.roughness.input_gain)
         load = _quantised(load, sensors.load_step_n)
     return Recording(
         t_s,
-        _quantised(motion.height_m + noise, sensors.height_step_m),
+        _quantised(_late(t_s, motion, sensors.late_s) + noise, sensors.height_step_m),
         load,
         cell,
         temperature,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import yaml
+from scipy.interpolate import CubicHermiteSpline
 
 from tests.truth import dyno, simulation
 from tests.truth.cases import FAMILIES, FOREIGN_KINDS, NONLINEAR_FAMILIES, make_case
@@ -385,6 +386,27 @@ def test_floor_is_what_band_limited_inverse_dynamics_leave():
     stiffness = stiffness + 1j * bench.damping_n_s_per_m * omega
     force = np.fft.irfft(np.fft.rfft(noise) * stiffness * (frequency <= BAND_HZ), count)
     assert np.std(force) == pytest.approx(force_noise_floor_n(case), rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["disturbed", "dyno_disturbed"])
+def test_a_disturbed_bench_lacks_nothing_but_its_height_is_late_and_its_noise_coloured(kind):
+    """Lag-1 correlation of first-order noise: exp(-dt / tau) (Box, Jenkins, 3.2)."""
+    case = make_case(3, kind)
+    sensors, recording = case.sensors, record(case, case.train)
+    assert case.effects == ()
+    assert case.families == ("delay",)
+    before = CubicHermiteSpline(
+        recording.t_s, recording.true_height_m, recording.true_velocity_m_per_s
+    )(recording.t_s - sensors.late_s)
+    noise = (recording.height_m - before)[10:]
+    step_s = 1.0 / sensors.sample_rate_hz
+    kept = np.exp(-step_s / sensors.noise_time_s)
+    # The variance of an estimate from correlated samples is larger by (1 + kept) / (1 - kept).
+    scatter = np.sqrt((1.0 + kept) / (1.0 - kept) / len(noise))
+    assert np.std(noise) == pytest.approx(sensors.height_error_m, rel=4.0 * scatter)
+    share = sensors.height_noise_m**2 / sensors.height_error_m**2
+    lagged = float(np.mean(noise[1:] * noise[:-1]) / np.var(noise))
+    assert lagged == pytest.approx(kept * share, abs=4.0 * scatter)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from dart_model.effects import effect
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.problem import StrutEffect, nominal
 from rig.diagnosis.search.explore import FirstRound
-from rig.diagnosis.search.pool import Pool, ValidatedModel
+from rig.diagnosis.search.pool import Pool, ValidatedModel, standard_error
 from rig.diagnosis.search.screen import Screening
 
 _NEAR = 1.1
@@ -88,13 +88,34 @@ def _in_simulation(
     if not chosen.size:
         if pool.at_floor(chosen):
             return left, "without any law the residual is at the noise floor"
-        return left, f"it reduces the residual of the linear model by {100.0 * (1.0 - left):.3g} %"
+        return left, _too_little(source, model)
+    ratio = f"{left / least:.3f}" if left < _NEAR * least else f"{left / least:.3g}"
+    if left < least / _SAME:
+        more = len(model.fit.parts.effects) > len(chosen.fit.parts.effects)
+        return left, (
+            f"its residual is {ratio} times that of the chosen model, which differs by no more "
+            f"than chance{', and it has more parameters' if more else ''}"
+        )
     if left < _SAME * least:
         is_plainer = len(model.fit.parts.effects) <= len(chosen.fit.parts.effects)
         return left, f"it fits no better{'' if is_plainer else ', with more parameters'}"
     alone = "alone, " if chosen.size > 1 else ""
-    ratio = f"{left / least:.3f}" if left < _NEAR * least else f"{left / least:.3g}"
     return left, f"{alone}its residual is {ratio} times that of the chosen model"
+
+
+def _too_little(pool: Pool, model: ValidatedModel) -> str:
+    """What a law alone takes off the mean square residual of the linear model, and has to."""
+    gain = pool.linear.cost - model.cost
+    if gain <= 0.0:
+        return "it does not reduce the residual of the linear model"
+    share = gain / max(pool.linear.cost, 1e-300)
+    scatter = standard_error(model, pool.linear) / max(pool.linear.cost, 1e-300)
+    text = f"it takes {100.0 * share:.3g} % off the linear model's mean square residual"
+    if share <= pool.criteria.standard_errors * scatter:
+        return f"{text}, which scatters by {100.0 * scatter:.3g} % between parts of the recordings"
+    if not pool.gains_share(model, pool.linear):
+        return f"{text}; a law has to take {100.0 * pool.criteria.least_share:.3g} % off"
+    return text
 
 
 def _along_motion(screening: Screening, best: Screening | None) -> tuple[float, str]:

@@ -1,14 +1,21 @@
 """The first screen of a diagnosis: what was found, what it means, and how certain that is."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from dart_model.effects import AMBIENT_C, FAMILY_WORDS, Effect, effect
 from dart_model.effects.calling import force_over_arrays
-from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection, ModelErrors, Result
+from rig.diagnosis.outcome import (
+    Diagnosis,
+    FoundEffect,
+    LinearCorrection,
+    ModelErrors,
+    RejectedEffect,
+    Result,
+)
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.number_formats import (
     capital,
@@ -33,7 +40,7 @@ from rig.pages.report.words import (
 
 _NOT_USED = "on data not used for fitting"
 _NOTHING_GAINED = 0.75
-"""Share of the residual force above which a correction is none."""
+"""Share of the residual force, and of the error that decides, above which a correction is none."""
 
 _POINTS = 121
 """Points along the travel, and along the speeds, among which the largest force of a law is found:
@@ -99,18 +106,19 @@ def remainder(diagnosis: Diagnosis) -> Statement:
         diagnosis.verdict == "ambiguous" and is_at_floor
     ):
         return Statement("good", "✓", f"Only noise is left: {times(ratio)} times the noise floor.")
-    force = diagnosis.held_out.residual_force_rmse_n
-    share = percent(force.after / force.before, 1) if force.before > 0.0 else "–"
     tone, sign = ("bad", "✕") if diagnosis.verdict == "not_explained" else ("part", "◐")
     if is_at_floor:
         text = "On at least one run the error is above the noise: something is still missing."
         return Statement(tone, sign, text)
     above = f"{times(ratio)} times the noise floor" if math.isfinite(ratio) else "floor not known"
-    if force.after > _NOTHING_GAINED * force.before:
-        text = f"No law reduces it ({above}): the given model is as good as any that was found."
-        return Statement("idle", "–", text)
-    text = f"{share} of the residual force is left ({above}): something is still missing."
-    return Statement(tone, sign, text)
+    force = diagnosis.held_out.residual_force_rmse_n
+    for what, errors in (("residual force", force), ("height error", figure)):
+        if errors.after <= _NOTHING_GAINED * errors.before:
+            share = percent(errors.after / errors.before, 1)
+            text = f"{share} of the {what} is left ({above}): something is still missing."
+            return Statement(tone, sign, text)
+    text = f"No law reduces it ({above}): the given model is as good as any that was found."
+    return Statement("idle", "–", text)
 
 
 def _deciding(diagnosis: Diagnosis) -> tuple[ModelErrors, float]:
@@ -188,7 +196,7 @@ def _values(diagnosis: Diagnosis) -> tuple[str, ...]:
                 estimate = item.parameters[parameter.name]
                 value, interval = value_and_interval(estimate, parameter.unit)
                 texts.append(f"{capital(label(parameter))} {value} (95 %: {interval})")
-    for item in diagnosis.linear:
+    for item in filter(_differs, diagnosis.linear):
         value, interval = value_and_interval(item.total, LINEAR[item.parameter][1])
         texts.append(f"{_direction(item)}: {value} (95 %: {interval})")
     texts += [describe_channel(item) for item in wrong_channels(diagnosis)]
@@ -290,13 +298,22 @@ def _rivals(diagnosis: Diagnosis) -> Statement:
         if diagnosis.verdict == "explained":
             return Statement("good", "✓", "No law reduces the error further.")
         return Statement("bad", "✕", f"None of {len(tried)} laws explains it.")
-    nearest = tried[0]
+    return _nearest_rival(diagnosis, tried)
+
+
+def _nearest_rival(diagnosis: Diagnosis, tried: Sequence[RejectedEffect]) -> Statement:
+    nearest = min(tried, key=lambda item: item.left or 0.0)
     tested = "The one rival" if len(tried) == 1 else f"The nearest of {len(tried)} rivals"
     text = (
         f"{tested}, {effect(nearest.name).words}, leaves {percent(nearest.left, 1)} of the linear "
-        "model's residual."
+        "model's residual"
     )
-    return Statement("good", "✓", text)
+    if diagnosis.left is None:
+        return Statement("good", "✓", f"{text}.")
+    text += f"; what is named here leaves {percent(diagnosis.left, 1)}."
+    if diagnosis.left < (nearest.left or 0.0):
+        return Statement("good", "✓", text)
+    return Statement("part", "?", f"{text} It was not chosen: {nearest.why.rstrip('.')}.")
 
 
 def _load_cell(diagnosis: Diagnosis) -> Statement:

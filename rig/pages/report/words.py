@@ -252,7 +252,7 @@ def _parts(shown: Sequence[Interval], recorded: Interval, name: str, unit: str) 
     if share > _ALL:
         return f"at all recorded {name} ({reach})"
     if not shown:
-        return f"at no part of the recorded {name} by itself ({reach})"
+        return f"no place of its own over the recorded {name} ({reach})"
     parts = join_words([_from_to(part, unit) for part in shown], "and")
     return f"at {name} {parts} (recorded {reach})"
 
