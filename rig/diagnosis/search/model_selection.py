@@ -1,7 +1,6 @@
 """From the fitted models to the reported one: without superfluous laws and corrections."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from itertools import chain
 from typing import NamedTuple
@@ -11,9 +10,8 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from dart_model.effects.calling import arguments
-from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.outcome import RejectedEffect
-from rig.diagnosis.problem.channel_delays import is_undetermined, search_undetermined
+from rig.diagnosis.problem.channel_delays import is_undetermined
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
@@ -29,6 +27,7 @@ from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel, adds_an_imitator
+from rig.diagnosis.search.poor_motions import rivals_of_poor_motion, springs_and_dampers
 from rig.diagnosis.search.rejections import list_rejections, residual_left
 from rig.diagnosis.search.screen import (
     as_screening,
@@ -149,7 +148,7 @@ def select_model(
             break
         is_repeated = True
     progress("comparing rivals", 0.9)
-    rivals = _rivals(pool, chosen) or _rivals_of_one_frequency(pool, final)
+    rivals = _rivals(pool, chosen) or rivals_of_poor_motion(pool, final)
     superfluous = _superfluous_effects(pool, chosen)
     lawless = _with_few_corrections(pool, pool.linear).model if final.size else final
     alike = () if is_gain else _with_other_corrections(pool, full, final.fit)
@@ -413,67 +412,6 @@ def _superfluous_effects(pool: Pool, chosen: ValidatedModel) -> tuple[int, ...]:
     return tuple(superfluous)
 
 
-# --- recordings of one frequency --------------------------------------------------------------
-
-
-def _springs_and_dampers(pool: Pool, free: Flags) -> list[int]:
-    """Corrections of stiffness or damping among the free linear parameters (L,), by index."""
-    linear = pool.problem.linear
-    return [i for i in np.flatnonzero(free).tolist() if linear[i].kind in ("stiffness", "damping")]
-
-
-def _rivals_of_one_frequency(pool: Pool, chosen: ValidatedModel) -> tuple[ValidatedModel, ...]:
-    """A late channel, or a law with memory, that explains as much as corrections of a strut.
-
-    Along a single sine whatever is linear is a stiffness and a damping. The first estimate of the
-    delays shows whether a recording is such a one.
-    """
-    unknown = [i for i, p in enumerate(pool.problem.linear) if is_undetermined(p)]
-    corrected = _springs_and_dampers(pool, chosen.fit.free)
-    if not unknown or not corrected:
-        return ()
-    rivals = [_with_delays_instead(pool, chosen, corrected, unknown)]
-    for strut in {pool.problem.linear[i].strut for i in corrected}:
-        own = [i for i in corrected if pool.problem.linear[i].strut == strut]
-        rivals.append(_with_memory_instead(pool, chosen, own, unknown, strut))
-    return tuple(rival for rival in rivals if rival is not None)
-
-
-def _with_delays_instead(
-    pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int]
-) -> ValidatedModel | None:
-    """The chosen model with delays in place of one or all of its corrections."""
-    problem = replace(pool.problem, linear=search_undetermined(pool.problem.linear))
-    for dropped in (corrected, *([i] for i in corrected)):
-        linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
-        linear[list(dropped)], free[list(dropped)], free[list(unknown)] = 0.0, False, True
-        first = chosen.fit.model.with_linear(linear)
-        result = fit(problem, first, free, FINAL)
-        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
-            return rival
-    return None
-
-
-def _with_memory_instead(
-    pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int], strut: int
-) -> ValidatedModel | None:
-    """The chosen model with a relaxing spring in place of a strut's corrections."""
-    linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
-    for indices in (corrected, unknown):
-        linear[list(indices)], free[list(indices)] = 0.0, False
-    law = (strut, MAXWELL.name)
-    candidate = chosen.fit.candidate.with_effects(law)
-    if candidate == chosen.fit.candidate:
-        return None
-    plain = chosen.fit.model.with_linear(linear)
-    for start in MAXWELL.starts(pool.problem.motions[strut]):
-        first = model_for(pool.problem, plain, candidate, {law: np.array(start)})
-        result = fit(pool.problem, first, free, FINAL)
-        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
-            return rival
-    return None
-
-
 # --- insignificant linear corrections ---------------------------------------------------------
 
 
@@ -531,7 +469,7 @@ def _significant_corrections(pool: Pool, result: Fit) -> Flags:
     significant = _significant_parameters(result, pool.criteria.significant)
     # Where the data do not show a delay, spring and damper are known no better than it.
     for i, p in enumerate(pool.problem.linear):
-        significant[i] |= is_undetermined(p) and bool(_springs_and_dampers(pool, significant))
+        significant[i] |= is_undetermined(p) and bool(springs_and_dampers(pool, significant))
     return significant
 
 

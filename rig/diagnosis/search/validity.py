@@ -159,13 +159,20 @@ def _find_linear_law(
 ) -> str | None:
     """Reason against a law that is a linear spring and damper along this motion."""
     for row, name in new_laws(result):
-        strut, force = forces[row]
-        basis = linear_forces(along, strut)
-        nonlinear = force - basis @ (basis.T @ force)
-        size = float(np.linalg.norm(force))
-        if size <= 0.0 or float(np.linalg.norm(nonlinear)) < criteria.leftover * size:
+        strut, force_n = forces[row]
+        if is_linear_along(along, strut, force_n, criteria):
             return f"along this motion it is a linear spring and damper ({name})"
     return None
+
+
+def is_linear_along(
+    along: Sequence[Track], strut: int, force_n: Array, criteria: SelectionCriteria
+) -> bool:
+    """Whether a force (N,) is that of a preload, a spring and a damper along motions."""
+    basis = linear_forces(along, strut)
+    nonlinear_n = force_n - basis @ (basis.T @ force_n)
+    size = float(np.linalg.norm(force_n))
+    return size <= 0.0 or float(np.linalg.norm(nonlinear_n)) < criteria.leftover * size
 
 
 def _find_cancelling_laws(
