@@ -243,7 +243,7 @@ GAS_SPRING = _spring(
     name="gas_spring",
     words="a gas spring (polytropic)",
     parameters=(
-        Parameter("charge_force_n", "N", -1e12, 1e12, "force at the free length"),
+        Parameter("charge_force_n", "N", 0.0, 1e12, "force at the free length"),
         *_GAS,
     ),
     force=_gas,
@@ -261,7 +261,7 @@ BALANCED_GAS_SPRING = _spring(
         Parameter(
             "charge_force_n",
             "N",
-            -1e12,
+            0.0,
             1e12,
             "gas force at the free length, which a constant force balances",
         ),
