@@ -1,6 +1,7 @@
 """Estimates with confidence intervals of what a fit determines, and the laws that it contains."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +63,28 @@ class FitEstimates(NamedTuple):
             value + nominal, max(value - half, low) + nominal, min(value + half, high) + nominal
         )
 
+    def estimate_of_law(self, variable: int) -> Estimate:
+        """The same of a law's parameter; open where that is at the end of its range."""
+        found = self.estimate(variable)
+        match self.end_of_range(variable):
+            case "lower":
+                return replace(found, low=None)
+            case "upper":
+                return replace(found, high=None)
+            case _:
+                return found
+
+    def end_of_range(self, variable: int) -> str | None:
+        """The end of the range, `lower` or `upper`, at which a search variable is; none is zero."""
+        space = self.fit.space
+        low, high = float(space.low[variable]), float(space.high[variable])
+        value = float(self.fit.solution.values[variable])
+        near = AT_BOUND * (abs(value) if low > 0.0 else float(space.scale[variable]))
+        for name, bound in (("lower", low), ("upper", high)):
+            if low < high and bound and abs(value - bound) <= near:
+                return name
+        return None
+
     def half_of(self, variables: NDArray[np.intp], weights: Sequence[Sequence[float]]) -> Array:
         """Half-widths of the intervals of sums of parameters, shape (n,).
 
@@ -89,7 +112,7 @@ def estimates_of(
     result = estimates.fit
     variables = effect_variables(problem, result).get(row)
     if variables is not None:
-        return effect(name).named(estimates.estimate(int(v)) for v in variables)
+        return effect(name).named(estimates.estimate_of_law(int(v)) for v in variables)
     slot = slots_of(problem, result.candidate).each[row]
     values = result.parts.effects[slot.parameters]
     return effect(name).named(Estimate(float(value), None, None) for value in values)

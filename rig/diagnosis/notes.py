@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.estimates import (
-    AT_BOUND,
     FitEstimates,
     LawFound,
     find_preload_of_springs,
@@ -213,24 +212,20 @@ def _notes_of_channels(channels: Sequence[ChannelCorrection]) -> tuple[str, ...]
 
 def _notes_of_bounds(problem: Problem, estimates: FitEstimates) -> tuple[str, ...]:
     """Parameters of laws at the end of the range in which they are searched, other than zero."""
-    fit, space = estimates.fit, estimates.fit.space
+    fit = estimates.fit
     names = [problem.existing[index].name for index in fit.candidate.kept]
     names += [name for _, name in fit.candidate.new]
     notes: list[str] = []
     for row, variables in effect_variables(problem, fit).items():
         law = effect(names[row])
         for variable, parameter in zip(variables.tolist(), law.parameters, strict=True):
-            low, high = float(space.low[variable]), float(space.high[variable])
-            value = float(fit.solution.values[variable])
-            near = AT_BOUND * (abs(value) if low > 0.0 else float(space.scale[variable]))
-            ends = {low: "lower", high: "upper"} if low < high else {}
-            at = [end for bound, end in ends.items() if bound and abs(value - bound) <= near]
-            if at and estimates.estimate(variable).low is not None:
-                text = f"{value:.3g} {parameter.unit}".rstrip()
+            end, estimate = estimates.end_of_range(variable), estimates.estimate(variable)
+            if end is not None and estimate.low is not None:
+                text = f"{estimate.value:.3g} {parameter.unit}".rstrip()
                 notes.append(
-                    f"{parameter.name} of {law.name} is at the {at[0]} end of its range "
-                    f"({text}): the data may require a value beyond it, and "
-                    "its interval is not to be relied on."
+                    f"{parameter.name} of {law.name} is at the {end} end of its range "
+                    f"({text}): the data may require a value beyond it, and its interval is open "
+                    "there."
                 )
     return tuple(notes)
 

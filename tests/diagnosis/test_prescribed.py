@@ -171,17 +171,20 @@ class SteepStop(Nothing):
         return 900.0 * (max(0.29 - z, 0.0) / 0.02) ** 6.0
 
 
-def test_a_parameter_at_the_end_of_its_range_is_noted():
+def test_a_parameter_at_the_end_of_its_range_is_noted_and_has_an_open_interval():
     parameters = (
         "{contact_height_m: 0.28, force_at_10_mm_n: 300.0, exponent: 3.5, dissipation_s_per_m: 0}"
     )
     model = dyno.model(effects=f"[{{name: power_bump_stop, parameters: {parameters}}}]")
     runs = [dyno.run(SteepStop()), dyno.run(SteepStop(), seed=2)]
-    notes = diagnose(model, runs[:1], runs[1:]).diagnosis.notes
+    found = diagnose(model, runs[:1], runs[1:]).diagnosis
     assert any(
-        "exponent of power_bump_stop is at the upper end of its range (4" in n for n in notes
+        "exponent of power_bump_stop is at the upper end of its range (4" in n for n in found.notes
     )
-    assert not any("lower end" in note for note in notes)
+    assert not any("lower end" in note for note in found.notes)
+    (exponent,) = (item.parameters["exponent"] for item in found.existing)
+    assert exponent.low is not None
+    assert exponent.high is None
 
 
 class Creep(Nothing):
