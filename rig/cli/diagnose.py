@@ -2,14 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.junit import JUNIT, JUnitFile, write_junit
 from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
 from rig.cli.terminal import JsonFlag, Labels, PrintToo, print_text, refuse_existing
+
+if TYPE_CHECKING:
+    from rig.diagnosis.outcome import Diagnosis
 
 _FAR_LESS = 0.5
 """Share of the residual force from which on a corrected model is worth its corrections."""
@@ -81,8 +85,18 @@ def diagnose(
     print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
         print_text(f"Printed: {out}/report.pdf")
-    force, floor = result.diagnosis.held_out.residual_force_rmse_n, result.diagnosis.noise_floor
-    if result.diagnosis.verdict == "not_explained":
+    _print_next_step(result.diagnosis, runs, model, held_out or [], out)
+
+
+def _print_next_step(
+    found: "Diagnosis", runs: list[Path], model: str, held_out: list[Path], out: Path
+) -> None:
+    """Print what to do with a corrected model, with the gains that belong to it."""
+    from rig.diagnosis.outcome import CORRECTED_FILE
+    from rig.pages.report.words import is_prescribed
+
+    force, floor = found.held_out.residual_force_rmse_n, found.noise_floor
+    if found.verdict == "not_explained":
         if not force.after < _FAR_LESS * force.before:
             print_text(f"No law explains what {model} lacks: continue with {model}.")
             return
@@ -90,23 +104,50 @@ def diagnose(
             f"No law explains what remains, but {out}/corrected.yaml lacks {force.after:.3g} N RMS "
             f"instead of {force.before:.3g} N."
         )
-    if result.diagnosis.verdict == "partly_explained":
-        others = "".join(f" --held-out {path}" for path in held_out or [])
+    if found.verdict == "partly_explained":
+        others = "".join(f" --held-out {path}" for path in held_out)
         print_text(
             f"The corrected model still lacks {force.after:.3g} N RMS of {force.before:.3g} N "
             f"(noise alone: {floor.residual_force_rmse_n:.2g} N). Only if that is too much for "
             "your use, diagnose what it lacks: `rig diagnose "
             f"{' '.join(map(str, runs))} --model {out}/corrected.yaml{others} --out {out}_2`"
         )
-    is_driven = result.diagnosis.held_out.strut_force_rmse_n is None
-    if is_driven and (result.diagnosis.effects or result.diagnosis.linear):
+    if not is_prescribed(found) and (found.effects or found.linear):
+        run = next((path for path in runs if path.is_dir()), None)
+        if run is not None:
+            print_gains(run, out / CORRECTED_FILE)
         print_text(
-            f"Next: `rig tune CONFIG --model {out}/corrected.yaml --run {_run_of(runs)} --out "
+            f"Next: `rig tune CONFIG --model {out}/corrected.yaml --run {run or 'RUN'} --out "
             "tuned-corrected.yaml`, as the old gains suit the old model; then `rig run "
             "tuned-corrected.yaml`"
         )
 
 
-def _run_of(paths: list[Path]) -> str:
-    """The first of the recordings that is a run, whose frames a tuning can follow again."""
-    return next((str(path) for path in paths if path.is_dir()), "RUN")
+def print_gains(run: Path, corrected: Path) -> None:
+    """Print the gains that belong to a corrected model, at the rate and latency of a run."""
+    import yaml
+
+    from dart_model.spec import load_model
+    from rig.plan.load import plan_of_run
+    from rig.tuning.gains import Aim
+    from rig.tuning.tune import settings_of, tune
+
+    plan = plan_of_run(run, load_model(corrected))
+    try:
+        with progress_bar() as bar:
+            struts = tune(plan, run, "kalman", Aim(), bar)
+    except InputError as error:
+        print_text(f"No gains for {corrected}: {error}", "yellow")
+        return
+    print_text(f"Gains for {corrected} at {1e9 / plan.period_ns:g} Hz, `observers:` of CONFIG:")
+    observers = {strut.name: _rounded(settings_of(strut.tuned.observer)) for strut in struts}
+    for line in yaml.safe_dump(observers, sort_keys=False).splitlines():
+        print_text(f"  {line}")
+
+
+def _rounded(value: object) -> object:
+    """Settings with numbers of four digits."""
+    if isinstance(value, dict):
+        settings = cast("dict[str, object]", value)
+        return {key: _rounded(item) for key, item in settings.items()}
+    return float(f"{value:.4g}") if isinstance(value, float) else value

@@ -6,7 +6,7 @@ from pathlib import Path
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
-from dart_model.spec import load_model, load_named_model
+from dart_model.spec import ModelSpec, load_model, load_named_model
 from rig.files.file_kinds import FILE_KINDS
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunHeader, read_header
@@ -40,17 +40,19 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
     return replace(plan, authentication=settings.load(path))
 
 
-def plan_of_run(folder: Path) -> Plan:
+def plan_of_run(folder: Path, model: ModelSpec | None = None) -> Plan:
     """The plan that a run follows, or followed, from the files in its folder; without its key.
+
+    Another model may replace the run's.
 
     Raises:
         InputError: A file of the run is missing or damaged.
         DatabaseError: Its DBC is.
     """
-    return plan_of_header(folder, read_header(folder))
+    return plan_of_header(folder, read_header(folder), model)
 
 
-def plan_of_header(folder: Path, header: RunHeader) -> Plan:
+def plan_of_header(folder: Path, header: RunHeader, model: ModelSpec | None = None) -> Plan:
     """The plan of a run whose header has been read, as of `plan_of_run`.
 
     Raises:
@@ -59,5 +61,5 @@ def plan_of_header(folder: Path, header: RunHeader) -> Plan:
     """
     source = folder / RUN_FILE
     config = validate(RunConfig, header.get("config"), f"{source}: config")
-    model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
-    return resolve(config, source, model, database)
+    spec = load_model(folder / MODEL_FILE) if model is None else model
+    return resolve(config, source, spec, load_database(folder / DBC_FILE))

@@ -5,9 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
+from dart_model.spec import dump_model, load_model
+from rig.cli.diagnose import print_gains
 from rig.cli.main import main
+from rig.diagnosis.progress import no_progress
 from rig.plan.config import CONFIGS
+from rig.plan.load import plan_of_run
+from rig.tuning.gains import Aim
+from rig.tuning.tune import settings_of, tune
 
 EXAMPLE = CONFIGS / "reference.yaml"
 
@@ -228,6 +235,25 @@ def test_a_diagnosis_into_a_file_is_refused_before_it_begins(
     arguments = (case_folder / "run", "--model", "reference", "--out", tmp_path / "file" / "found")
     assert rig(monkeypatch, "diagnose", *arguments) == 2
     assert "expected a folder to write into" in one_line(capsys)
+
+
+def test_a_diagnosis_prints_the_gains_of_its_corrected_model_for_the_run(
+    case_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = tmp_path / "corrected.yaml"
+    spec = load_model(case_folder / "run" / "model.yaml")
+    (strut,) = spec.struts
+    stiffer = strut.model_copy(update={"stiffness_n_per_m": 1.5 * strut.stiffness_n_per_m})
+    model.write_text(dump_model(spec.model_copy(update={"struts": (stiffer,)})), "utf-8")
+    print_gains(case_folder / "run", model)
+    head, *lines = capsys.readouterr().out.split(" of CONFIG:\n")
+    assert f"at {1e9 / plan_of_run(case_folder / 'run').period_ns:g} Hz" in " ".join(head.split())
+    (settings,) = yaml.safe_load("".join(lines)).values()
+    source, plan = case_folder / "run", plan_of_run(case_folder / "run", load_model(model))
+    (tuned,) = tune(plan, source, "kalman", Aim(), no_progress)
+    wanted = settings_of(tuned.tuned.observer)
+    assert settings["kind"] == wanted["kind"] == "kalman"
+    assert settings["filter"] == pytest.approx(wanted["filter"], rel=1e-3)
 
 
 def test_a_run_that_is_held_out_too_is_refused(
