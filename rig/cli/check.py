@@ -115,6 +115,9 @@ def _check_recordings(
     else:
         for title, rows in texts.recordings(found):
             print_table(("", ""), rows, title)
+        if rows := texts.delays(found):
+            heads = ("channel", "seems late by", "standard deviation")
+            print_table(heads, rows, "Delays, if the model lacks no law")
         heads = ("parameter", "strut", "nominal", "known to", "model file", "varies with")
         print_table(heads, texts.linear(found), "Linear part, standard deviations")
         heads = ("family", "strut", "found from", "of the force", "nearest family", "named from")

@@ -25,10 +25,13 @@ from rig.diagnosis.numerics.blas import with_one_blas_thread
 from rig.diagnosis.numerics.laws import compile_law
 from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem.build import build_without_delays
+from rig.diagnosis.problem.channel_delays import SIGNIFICANT
+from rig.diagnosis.problem.delay_estimate import LEAST_WIDTH_S, estimate_delays
 from rig.diagnosis.problem.linear_part import PARAMETERS
-from rig.diagnosis.problem.problem import rms
+from rig.diagnosis.problem.problem import Problem, rms
 from rig.diagnosis.problem.track import segment_forces, strut_forces
 from rig.diagnosis.recording_bounds import (
+    DelayBound,
     Determinable,
     FamilyBound,
     LinearBound,
@@ -85,7 +88,17 @@ def find_determinable(spec: ModelSpec, recordings: Sequence[Recording]) -> Deter
     seen = {bound.family for bound in families}
     every = dict.fromkeys(effect(name).family for _, name in candidate_laws(problem))
     unexcited = tuple(family for family in every if family not in seen)
-    return Determinable(tuple(facts), _linear_bounds(stage), families, unexcited)
+    gaps = tuple(run.gaps.report(run.name) for run in recordings if run.gaps)
+    delays = _delay_bounds(problem)
+    return Determinable(tuple(facts), _linear_bounds(stage), families, unexcited, delays, gaps)
+
+
+def _delay_bounds(problem: Problem) -> tuple[DelayBound, ...]:
+    estimates = estimate_delays(problem)
+    return tuple(
+        DelayBound(channel, delay_s, std_s, max(SIGNIFICANT * std_s, LEAST_WIDTH_S))
+        for channel, (delay_s, std_s) in estimates.items()
+    )
 
 
 def recording_facts(recording: Recording, strut: str, index: int) -> RecordingFacts:

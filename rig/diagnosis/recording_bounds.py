@@ -44,6 +44,28 @@ class RecordingFacts:
 
 
 @dataclass(frozen=True)
+class DelayBound:
+    """By how much a channel seems late, if the model lacks no law.
+
+    Attributes:
+        channel: As in ``channels`` of a diagnosis.
+        delay_s: Estimate, against the applied force, or the height where motion is prescribed.
+        std_s: Its standard deviation.
+        least_s: From which on a delay is believed although the model may lack laws.
+    """
+
+    channel: str
+    delay_s: float
+    std_s: float
+    least_s: float
+
+    @property
+    def is_late(self) -> bool:
+        """Whether it is late, or early, by more than missing laws feign."""
+        return abs(self.delay_s) > self.least_s
+
+
+@dataclass(frozen=True)
 class LinearBound:
     """How well the motion determines a linear parameter.
 
@@ -106,9 +128,13 @@ class Determinable:
         linear: Bounds of the linear parameters that act.
         families: Bounds of the families that act, those first that are named with the least force.
         unexcited: Families of which no law acts on the recordings.
+        delays: What is known of the channels' delays.
+        gaps: A line on each recording that has gaps in what drives the bench.
     """
 
     recordings: tuple[RecordingFacts, ...]
     linear: tuple[LinearBound, ...]
     families: tuple[FamilyBound, ...]
     unexcited: tuple[str, ...]
+    delays: tuple[DelayBound, ...]
+    gaps: tuple[str, ...]

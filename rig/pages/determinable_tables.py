@@ -3,7 +3,13 @@
 import math
 
 from dart_model.effects import FAMILY_WORDS
-from rig.diagnosis.recording_bounds import Determinable, FamilyBound, LinearBound, RecordingFacts
+from rig.diagnosis.recording_bounds import (
+    DelayBound,
+    Determinable,
+    FamilyBound,
+    LinearBound,
+    RecordingFacts,
+)
 from rig.pages.number_formats import capital, number, percent, quantity, share
 from rig.pages.report.words import LINEAR
 
@@ -49,6 +55,13 @@ def linear(found: Determinable) -> tuple[Row, ...]:
     return tuple(rows)
 
 
+def delays(found: Determinable) -> tuple[Row, ...]:
+    """Channel, by how much it seems late, and the standard deviation of that."""
+    return tuple(
+        (it.channel, quantity(it.delay_s, "s"), quantity(it.std_s, "s")) for it in found.delays
+    )
+
+
 def families(found: Determinable) -> tuple[Row, ...]:
     """Family, strut, least force, its share, the family that is most alike, and apart from when."""
     return tuple(
@@ -69,6 +82,8 @@ def warnings(found: Determinable) -> tuple[str, ...]:
     texts: list[str] = []
     for it in found.recordings:
         texts += _of_recording(it)
+    texts += found.gaps
+    texts += [_of_delay(it) for it in found.delays if it.is_late]
     texts += [_of_parameter(it) for it in found.linear if not it.is_determined or it.alike]
     texts += [_of_family(it) for it in found.families if not it.is_determined]
     texts += [
@@ -104,6 +119,14 @@ def _of_recording(it: RecordingFacts) -> list[str]:
             "Record a sweep or noise."
         )
     return [f"{it.recording}, strut {it.strut}: {text}" for text in texts]
+
+
+def _of_delay(it: DelayBound) -> str:
+    what = "late" if it.delay_s > 0.0 else "early"
+    return (
+        f"{it.channel} seems {quantity(abs(it.delay_s), 's')} {what}: find out whether it is, and "
+        "state `delay_s` in the configuration. A law that the model lacks may look like that, too."
+    )
 
 
 def _of_parameter(it: LinearBound) -> str:

@@ -14,6 +14,7 @@ from rig.pages.determinable_tables import warnings
 from rig.recordings.recording import Recording
 from tests.cli.test_commands import rig
 from tests.diagnosis import little_bench as bench
+from tests.diagnosis.late_channels import bench_run
 
 RATE_HZ = 500
 NOISE_M = 1e-5
@@ -102,6 +103,21 @@ def test_one_frequency_leaves_linear_parameters_alike():
     found = find_determinable(still, [once])
     text = " ".join(warnings(found))
     assert "hardly distinguished from" in text or "not determined" in text
+
+
+@pytest.mark.parametrize("late_s", [-4e-3, 0.0, 4e-3])
+def test_a_late_height_is_warned_of(late_s):
+    run = bench_run(bench.Nothing, late_s)
+    found = find_determinable(bench.model(), [run])
+    (delay,) = found.delays
+    assert delay.delay_s == pytest.approx(late_s, abs=5.0 * delay.std_s + 2e-5)
+    assert delay.is_late == (late_s != 0.0)
+    what = "late" if late_s > 0.0 else "early"
+    assert any(f"ms {what}" in text for text in texts_of(found)) == (late_s != 0.0)
+
+
+def texts_of(found):
+    return [text.replace("\N{NO-BREAK SPACE}", " ") for text in warnings(found)]
 
 
 class Friction(bench.Nothing):

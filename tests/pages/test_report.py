@@ -33,6 +33,7 @@ from rig.diagnosis.outcome import (
     White,
 )
 from rig.diagnosis.recording_bounds import (
+    DelayBound,
     Determinable,
     FamilyBound,
     LinearBound,
@@ -625,9 +626,12 @@ def test_what_the_recordings_determine_is_a_section():
     )  # fmt: skip
     friction = FamilyBound("friction", "strut", 0.2, 0.01, "hysteresis", 4.5, "slow strokes")
     mass = LinearBound("strut", "mass_kg", 10.0, 0.02, 0.5, None)
-    bounds = Determinable((facts,), (mass,), (friction,), ("fade",))
+    late = DelayBound("height_m:strut", 3e-3, 1e-4, 1e-3)
+    bounds = Determinable((facts,), (mass,), (friction,), ("fade",), (late,), ("A gap of 1 s.",))
     text = shown(report(determinable=bounds))
     assert "What these recordings can determine" in text
     assert "Friction 0.200 N 1.0 % hysteresis 4.50 N" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert "height_m:strut seems 3.00 ms late" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert "A gap of 1 s." in text
     assert "Fade of the damper: no law acts on these recordings." in text
     assert "What these recordings can determine" not in shown(report())

@@ -157,6 +157,7 @@ def _bounds(result: Result) -> dict[str, object]:
     return {
         "warnings": determinable_tables.warnings(found),
         "recordings": determinable_tables.recordings(found),
+        "delays": determinable_tables.delays(found),
         "linear": determinable_tables.linear(found),
         "families": determinable_tables.families(found),
     }
