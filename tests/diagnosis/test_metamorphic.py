@@ -277,6 +277,21 @@ def test_rough_nominal_values_change_no_answer(case, mass, stiffness, damping):
     check_rough(case, mass, stiffness, damping)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case",
+    ["friction", "dyno orifice"]
+    + [pytest.param(case, marks=pytest.mark.long) for case in ("hardening", "stop", "dyno stop")],
+)
+def test_the_fourth_digit_of_the_model_file_changes_no_answer(case):
+    kind, (train, test) = kind_of(case), recordings(case)
+    nominal = {"stiffness": 1.0001 * kind.STIFFNESS, "damping": 0.9999 * kind.DAMPING}
+    if kind is bench:
+        nominal["mass"] = 0.9999 * kind.MASS
+    other = diagnose(kind.model(**nominal), [train], [test])
+    same_answer(answer(case).diagnosis, other.diagnosis)
+
+
 # --- 3. Mirror ---------------------------------------------------------------------------------
 
 ABOUT_M = 0.45
