@@ -14,6 +14,7 @@ from rig.diagnosis.numerics.laws import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import RejectedEffect, Result, Verdict
 from rig.diagnosis.problem.build import Problems, build_problems, part_of, with_tones
+from rig.diagnosis.problem.delay_estimate import search_delays_beyond
 from rig.diagnosis.problem.problem import (
     CandidateModel,
     Problem,
@@ -233,7 +234,8 @@ def _explore_twice(
     given, linear = fits
     first = Pool(problem, given, [linear], criteria)
     first_round = search_along_motion(first, within(progress, 0.0, 0.3))
-    problem = _with_residual_noise(problem, first.chosen(criteria.most_laws).fit)
+    found = first.chosen(criteria.most_laws).fit
+    problem = search_delays_beyond(_with_residual_noise(problem, found), found.parts.linear)
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
     search_about_models(second, within(progress, 0.3, 1.0))
@@ -245,8 +247,9 @@ def _fit_to_all(
 ) -> Pool:
     """The models of a search in pieces fitted to all; the search continues unless one is right."""
     criteria, (given, linear) = searched.criteria, fits
-    pool = Pool(problem, given, [linear], criteria)
     found = searched.chosen(criteria.most_laws).fit
+    problem = search_delays_beyond(problem, found.parts.linear)
+    pool = Pool(problem, given, [linear], criteria)
     pool.adopt([found])
     # In the pieces a law may have come to rest where it is a simpler one, or beside its optimum.
     pool.screen_and_attempt(found.candidate.new)

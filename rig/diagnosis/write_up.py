@@ -98,7 +98,9 @@ def compose_result(
     found = find_laws(problem, estimates, after, criteria)
     tracks = [forces.track for forces in after if forces is not None]
     held_out = _held_out(evaluations, by_blocks=by_blocks)
-    others = _other_families(search) if verdict in ("ambiguous", "partly_explained") else ()
+    others = (
+        _other_families(problem, search) if verdict in ("ambiguous", "partly_explained") else ()
+    )
     is_explained = verdict in ("explained", "ambiguous")
     channels = channel_corrections(problem, estimates, is_explained=is_explained)
     floors = [run.floor for run in evaluations]
@@ -110,7 +112,7 @@ def compose_result(
         _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
         others,
-        _suggestion(search) if others or verdict == "ambiguous" else None,
+        _suggestion(problem, search) if others or verdict == "ambiguous" else None,
         held_out,
         NoiseFloor(
             quadratic_mean([floor.height_rmse_m for floor in floors]),
@@ -138,11 +140,20 @@ def compose_result(
     )
 
 
-def _other_families(search: SearchResult) -> tuple[str, ...]:
+def _linear_rivals(problem: Problem, search: SearchResult) -> list[str]:
+    """Effects by which rivals of the same laws replace corrections: a gain, or a delay."""
+    gain = np.array([p.kind == "gain" for p in problem.linear], dtype=np.bool_)
+    return [
+        EFFECTS["gain" if np.any(rival.fit.free & gain) else "delay"]
+        for rival in search.rivals
+        if rival.fit.candidate == search.chosen.fit.candidate
+    ]
+
+
+def _other_families(problem: Problem, search: SearchResult) -> tuple[str, ...]:
     """Families of the rivals that the chosen model lacks."""
     rivals = [effect(name).family for r in search.rivals for _, name in r.fit.candidate.new]
-    if any(r.fit.candidate == search.chosen.fit.candidate for r in search.rivals):
-        rivals.append("delay")
+    rivals += [effect(name).family for name in _linear_rivals(problem, search)]
     chosen = set(search.chosen.families)
     return tuple(dict.fromkeys(family for family in rivals if family not in chosen))
 
@@ -363,12 +374,14 @@ def _effects_hidden_from_bench(problem: Problem) -> tuple[RejectedEffect, ...]:
     )
 
 
-def _suggestion(search: SearchResult) -> str:
+def _suggestion(problem: Problem, search: SearchResult) -> str:
     """A recording that would distinguish the chosen model and its rivals."""
+    linear = _linear_rivals(problem, search)
+    if EFFECTS["gain"] in linear:
+        return "none; weigh what the applied force moves, or calibrate its sensor"
     models = [search.chosen, *search.rivals]
     names = [name for model in models for _, name in model.fit.candidate.new]
-    if any(rival.fit.candidate == search.chosen.fit.candidate for rival in search.rivals):
-        names.append("delay")
+    names += linear
     excitations = dict.fromkeys(effect(name).excitation for name in names)
     return "a run with " + "; and ".join(excitations)
 

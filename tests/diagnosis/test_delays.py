@@ -1,7 +1,7 @@
 """Late channels are found along with effects, and separated from them where motion allows it."""
 
 import random
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import pytest
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_step
 from rig.diagnosis.problem.channel_delays import known_share, late_columns, late_reader
-from rig.diagnosis.problem.delay_estimate import _about
+from rig.diagnosis.problem.delay_estimate import _about, search_delays_beyond
 from rig.diagnosis.problem.problem import Candidate, LinearParameter
 from rig.diagnosis.search.fit import linear_bounds
 from tests.diagnosis import little_bench as bench
@@ -54,6 +54,28 @@ def test_a_single_sine_determines_no_delay():
     step = delay_step([force_along((1.9,), 2e-4, noise_n=2.0)])
     assert not np.isfinite(step.stds_s).any()
     assert step.steps_s.tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("value_s", "ends_s"),
+    [(9.6e-3, (7.6e-3, 11.6e-3)), (10.6e-3, (9.6e-3, 11.6e-3)), (11.6e-3, (9.6e-3, 13.6e-3))],
+)
+def test_a_delay_that_a_fit_left_at_an_end_is_searched_for_beyond_it(value_s, ends_s):
+    late = LinearParameter(
+        0, "delay", 0.0, 2e-3, 9.6e-3, channel="height_m:strut", most=11.6e-3, expected=10.6e-3
+    )
+    problem = Beside(linear=(late, late._replace(kind="mass")))
+    found, mass = search_delays_beyond(problem, np.array([value_s, value_s])).linear
+    assert (found.least, found.most) == pytest.approx(ends_s)
+    assert found.expected == late.expected
+    assert (mass.least, mass.most) == (late.least, late.most)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a problem has of linear parameters."""
+
+    linear: tuple[LinearParameter, ...]
 
 
 def pair(*forces, delays):

@@ -38,5 +38,40 @@ def test_corrections_that_differ_from_zero_stay_alone(monkeypatch):
     assert corrections(monkeypatch, first=()) == {"damping"}
 
 
+def with_gain(mass):
+    """Corrections of a bench whose force is said to be a fifth smaller than it is.
+
+    All is then a quarter larger than in the model file, but for what is missing of the mass.
+    """
+    told = bench.run(bench.Nothing(), noise_m=1e-5, duration_s=8.0)
+    known = {"mass": mass / 1.25, "stiffness": bench.STIFFNESS / 1.25}
+    model = bench.model(damping=bench.DAMPING / 1.25, gravity=0.0, **known)
+    problem = build(model, [told], 32, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    few = model_selection._with_few_corrections(pool, pool.linear)
+    kinds = [p.kind for p in problem.linear]
+
+    def free(model):
+        return {kind for kind, is_free in zip(kinds, model.fit.free, strict=True) if is_free}
+
+    return free(few.model), [free(rival) for rival in few.rivals]
+
+
+def test_a_gain_stands_for_corrections_in_one_proportion():
+    kept, rivals = with_gain(bench.MASS)
+    assert "gain" in kept
+    assert kept.isdisjoint({"mass", "stiffness", "damping"})
+    assert rivals == []
+
+
+def test_a_gain_that_takes_the_mass_farther_is_a_rival_of_corrections_in_one_proportion():
+    kept, (rival,) = with_gain(1.2 * bench.MASS)
+    assert {"stiffness", "damping"} <= kept
+    assert "gain" not in kept
+    assert {"gain", "mass"} <= rival
+    assert rival.isdisjoint({"stiffness", "damping"})
+
+
 def test_a_correction_that_is_zero_once_others_are_gone_goes_too(monkeypatch):
     assert corrections(monkeypatch, first=("mass", "stiffness")) == {"damping"}

@@ -38,7 +38,7 @@ DAMPING = LinearParameter(0, "damping", 100.0, 40.0, -100.0)
 
 
 def reason(changes, law, lawless=(0.0, 0.0, 0.0), linear=(MASS, STIFFNESS, DAMPING)):
-    problem = SimpleNamespace(linear=linear)
+    problem = SimpleNamespace(linear=linear, motions=(None,))
     return validity.find_improbable_linear_part(
         problem, [(0, law)], np.array(changes), np.array(lawless), CRITERIA
     )
@@ -49,6 +49,26 @@ def test_laws_that_need_an_improbable_mass_are_not_believed():
     why = reason((2.1, 0.0, 0.0), "coulomb_friction")
     assert why is not None
     assert "mass_kg 12.1, 4.2 standard deviations from the model file's 10" in why
+
+
+GAIN = LinearParameter(0, "gain", 1.0, 0.02, -0.95)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_gain"),
+    [
+        ((2.2, 440.0, 22.0, 0.0), True),
+        ((2.2, 440.0 + 39.0, 22.0 - 3.9, 0.0), True),
+        ((2.2, 440.0 + 41.0, 22.0, 0.0), False),
+        ((2.2, 440.0, 22.0 + 4.1, 0.0), False),
+        ((2.2, 0.0, 0.0, 0.0), False),
+    ],
+)
+def test_a_linear_part_in_one_proportion_is_a_gain_of_the_applied_force(changes, is_gain):
+    linear = (MASS, STIFFNESS, DAMPING, GAIN)
+    why = reason(changes, "bouc_wen", (0.0,) * 4, linear)
+    assert (why is None) == is_gain
+    assert reason(changes[:3], "bouc_wen") is not None  # Where no force is applied.
 
 
 def test_a_correction_that_no_law_makes_larger_says_nothing_against_the_law():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rig.diagnosis.outcome import ModelErrors, RejectedEffect
 from rig.pages.report.finding import find, remainder
-from tests.pages.test_report import FALLS, FRICTION, MASS, SOFTER, found, report
+from tests.pages.test_report import FALLS, FRICTION, MASS, SOFTER, STOP, found, report
 
 LEFT = ModelErrors(2.3e-3, 2.3e-3, 4e-5, math.nan)
 
@@ -77,6 +77,16 @@ def test_a_load_cell_that_does_not_agree_is_said():
     assert "does not agree" in cell.text
     *_, cell = find(report()).certainty
     assert "No load cell" in cell.text
+
+
+def test_a_rival_of_linear_corrections_is_no_rival_of_the_law():
+    law = replace(FRICTION, where=STOP)
+    diagnosis = found("ambiguous", (law,), linear=(SOFTER,), ambiguous_with=("input_gain",))
+    headline = find(report(diagnosis)).headline
+    assert headline == (
+        "Dry friction (Coulomb) missing; Spring 13\u00a0% softer than in the model, or a wrong "
+        "gain of the applied force"
+    )
 
 
 def test_a_height_error_that_falls_is_no_model_as_good_as_any():

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.diagnosis.numerics.delay_step import DelayStep, ForceOverTime, delay_step
-from rig.diagnosis.problem.channel_delays import LONGEST_S, SIGNIFICANT
+from rig.diagnosis.problem.channel_delays import LONGEST_S, SIGNIFICANT, is_undetermined
 from rig.diagnosis.problem.problem import (
     LinearParameter,
     Problem,
@@ -30,6 +30,8 @@ one corner have in common was estimated with errors of 0.6 ms."""
 _VAGUE_S = 0.2e-3
 """Standard deviation from which on an estimate is vague: friction that weakens with speed was taken
 for a delay of 3.3 ms, with one of 0.27; delays that are there are known to some microseconds."""
+_AT_END = 0.01
+"""Share of the width from an end up to which a fitted delay is at it."""
 _MARGIN_S = 0.01
 """Time at either end of a recording where the smoothed motion is not used."""
 _MOST_SAMPLES = 40_000
@@ -43,6 +45,22 @@ def with_estimated_delays(problem: Problem) -> Problem:
         _about(p, *found[p.channel]) if p.channel in found else p for p in problem.linear
     )
     return replace(problem, linear=linear)
+
+
+def search_delays_beyond(problem: Problem, linear: Array) -> Problem:
+    """The problem whose delays are searched as far again beyond an end at which a fit left them.
+
+    Before a tone is known, or a stop, the first estimate may be off by more than its width: a tone
+    made 10.6 ms of 9.4. `linear` are the fit's corrections, shape (L,).
+    """
+    beyond: list[LinearParameter] = []
+    for p, value in zip(problem.linear, linear.tolist(), strict=True):
+        width_s, least, most = p.most - p.least, p.least, p.most
+        if p.kind == "delay" and not is_undetermined(p):
+            least -= width_s * (value - least < _AT_END * width_s)
+            most += width_s * (most - value < _AT_END * width_s)
+        beyond.append(p._replace(least=least, most=most))
+    return replace(problem, linear=tuple(beyond))
 
 
 def estimate_delays(problem: Problem) -> dict[str, tuple[float, float]]:

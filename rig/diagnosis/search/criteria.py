@@ -68,8 +68,9 @@ class SelectionCriteria:
         cancelling: Correlation of two forces in one strut below which they cancel each other.
         improbable: Standard deviations of the model file's values from which on laws are not
             believed that need such a mass, stiffness or damping, where no correction alone does (to
-            two deviations): one in some ten thousand is as far off (Gauss), so that the laws are
-            the likelier error.
+            two deviations) and a gain of the applied force does not (all in one proportion, to a
+            tenth of a deviation): one in some ten thousand is as far off (Gauss), so that the laws
+            are the likelier error.
         leftover: Least share of a law's force along the motion that no change of the linear part
             replaces; with less the law is a linear correction. A force is seldom known to
             less (class 0.5 of ISO 7500-1 is half a percent).

@@ -37,13 +37,11 @@ from rig.diagnosis.search.screen import (
     refine,
     scale_law,
 )
-from rig.diagnosis.search.validity import find_unidentifiable_law
+from rig.diagnosis.search.validity import SCALED_BY_GAIN, find_unidentifiable_law
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_SCALED_BY_GAIN = ("mass", "stiffness", "damping")
-"""Linear parameters that, changed in one proportion, are another gain of the applied force."""
 _GENERAL = 2
 """Laws of a family that are tried for a simpler one, best along the motion first."""
 _MORE_FITS, _STILL_FALLING = 3, 0.95
@@ -129,7 +127,7 @@ def select_model(
     while True:
         best = pool.chosen(most_laws)
         chosen = _without_superfluous_laws(pool, best, progress)
-        final, full, is_gain = _with_few_corrections(pool, chosen)
+        final, full, is_gain, with_gain = _with_few_corrections(pool, chosen)
         why = find_unidentifiable_law(pool.problem, final.fit) if final.size else None
         if why is not None:
             pool.reject(chosen.fit.candidate, why)
@@ -148,7 +146,7 @@ def select_model(
             break
         is_repeated = True
     progress("comparing rivals", 0.9)
-    rivals = _rivals(pool, chosen) or rivals_of_poor_motion(pool, final)
+    rivals = _rivals(pool, chosen) or rivals_of_poor_motion(pool, final) or with_gain
     superfluous = _superfluous_effects(pool, chosen)
     lawless = _with_few_corrections(pool, pool.linear).model if final.size else final
     alike = () if is_gain else _with_other_corrections(pool, full, final.fit)
@@ -421,11 +419,14 @@ class _FewCorrections(NamedTuple):
     Attributes:
         full: The fit with all corrections.
         is_gain: Whether a gain of the applied force replaces other corrections.
+        rivals: The model with such a gain, where it replaces as much, but the mass is then farther
+            from the model file's.
     """
 
     model: ValidatedModel
     full: Fit
     is_gain: bool
+    rivals: tuple[ValidatedModel, ...] = ()
 
 
 def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections:
@@ -438,12 +439,21 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
     if not result.size and not pool.prefers(result, as_given := pool.validate(pool.given)):
         # Corrections that differ from zero and change nothing that can be measured.
         return _FewCorrections(as_given, chosen.fit, is_gain=False)
-    begun = _begin_with_gain(problem, result.fit, chosen.fit, pool.criteria.significant)
+    few = _FewCorrections(result, chosen.fit, is_gain=False)
+    begun = _begin_with_gain(problem, result.fit, chosen.fit)
     refitted = None if begun is None else fit(problem, *begun, FINAL)
-    if refitted is not None and not pool.prefers(result, lean := pool.validate(refitted)):
-        model = _with_significant_corrections(pool, lean)
-        return _FewCorrections(model, chosen.fit, is_gain=True)
-    return _FewCorrections(result, chosen.fit, is_gain=False)
+    if begun is None or refitted is None or pool.prefers(result, lean := pool.validate(refitted)):
+        return few
+    before, after = result.fit.parts.linear, begun[0].parts.linear
+    if not _contradicts_prior(problem, before, after, pool.criteria.significant):
+        return few._replace(model=_with_significant_corrections(pool, lean), is_gain=True)
+    shares = [
+        before[i] / p.nominal
+        for i, p in enumerate(problem.linear)
+        if p.kind in SCALED_BY_GAIN and result.fit.free[i] and not begun[1][i]
+    ]
+    # What is as improbable as that two changes are alike to a hundredth by chance is a rival.
+    return few._replace(rivals=(lean,)) if max(shares) - min(shares) < _ALIKE else few
 
 
 def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
@@ -545,15 +555,14 @@ def _significant_parameters(result: Fit, significant: float) -> Flags:
 
 
 def _begin_with_gain(
-    problem: Problem, result: Fit, full: Fit, significant: float
+    problem: Problem, result: Fit, full: Fit
 ) -> tuple[CandidateModel, Flags] | None:
     """Where a fit with a gain in place of other corrections begins, and what is free in it, (L,).
 
-    None where a gain saves none, or is farther from the model file's tolerances. `full` is the fit
-    with all corrections.
+    None where a gain saves none. `full` is the fit with all corrections.
     """
     gain = _corrections_as_gain(problem, result, full)
-    if gain is None or _contradicts_prior(problem, result.parts.linear, gain[0], significant):
+    if gain is None:
         return None
     linear, free = gain
     (factor,) = (1.0 + linear[i] for i, p in enumerate(problem.linear) if p.kind == "gain")
@@ -580,7 +589,7 @@ def _corrections_as_gain(problem: Problem, result: Fit, full: Fit) -> tuple[Arra
     linear = problem.linear
     if len(problem.motions) > 1 or not any(p.kind == "gain" for p in linear):
         return None
-    scaled = {i for i, p in enumerate(linear) if p.kind in _SCALED_BY_GAIN and p.nominal > 0.0}
+    scaled = {i for i, p in enumerate(linear) if p.kind in SCALED_BY_GAIN and p.nominal > 0.0}
     shares, all_shares = (_shares_of_nominal(problem, it, scaled) for it in (result, full))
     alike: set[int] = set()
     for middle, _ in shares.values():

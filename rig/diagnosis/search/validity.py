@@ -55,6 +55,10 @@ _FARTHER = 2.0
 """Deviations by which laws may take a linear parameter farther from the model file's than the best
 linear model does, whose own parameters are bent by what it lacks: with a gain that is wrong by a
 third beside other effects, a mass went from 3.7 deviations to 5, where it was right."""
+SCALED_BY_GAIN = ("mass", "stiffness", "damping")
+"""Linear parameters that a gain of the applied force changes in one proportion."""
+_PROPORTIONAL = 0.1
+"""Deviations of the model file's up to which stiffness and damping changed as the mass did."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
 """Families that are no property of the strut, or that store energy outside it: may be active."""
 
@@ -205,6 +209,8 @@ def find_improbable_linear_part(
     linear one, and laws of a damper the linear damping. `linear` are the corrections together with
     the laws, `lawless` those of the best linear model, shapes (L,).
     """
+    if _is_gain(problem, linear):
+        return None
     families = {(strut, effect(name).family) for strut, name in laws}
     for p, change, alone in zip(problem.linear, linear, lawless, strict=True):
         if p.kind not in _REPLACED:
@@ -221,6 +227,26 @@ def find_improbable_linear_part(
                 "(its tolerance states how well that is known)"
             )
     return None
+
+
+def _is_gain(problem: Problem, linear: Array) -> bool:
+    """Whether mass, stiffness and damping changed in one proportion: the applied force has a gain.
+
+    Of one strut; changes that are alike by chance are one in a hundred.
+    """
+    kinds = {p.kind: i for i, p in enumerate(problem.linear)}
+    if len(problem.motions) > 1 or "gain" not in kinds:
+        return False
+    of_strut = [
+        (problem.linear[kinds[kind]], float(linear[kinds[kind]])) for kind in SCALED_BY_GAIN
+    ]
+    if any(p.nominal <= 0.0 for p, _ in of_strut):
+        return False
+    (mass, more_kg), *others = of_strut
+    share = more_kg / mass.nominal
+    return all(
+        abs(change - share * p.nominal) < _PROPORTIONAL * p.deviation for p, change in others
+    )
 
 
 def _find_harmonic_of_drive(

@@ -49,6 +49,9 @@ each is within a hundredth of the next."""
 _SHARES = (1.0, 0.5)
 """Of the way from mid-stroke (or from rest) to the end at which a law's force is stated."""
 
+_OF_LINEAR_PART = frozenset({"input_gain", "delay"})
+"""Rivals of linear corrections, not of laws."""
+
 _DIRECTIONS = {
     "mass_kg": ("Mass", "larger", "smaller"),
     "stiffness_n_per_m": ("Spring", "stiffer", "softer"),
@@ -147,6 +150,11 @@ def _headline(diagnosis: Diagnosis) -> str:
             if not rivals and any(item.is_candidate for item in diagnosis.effects):
                 return f"{capital(either)} missing"
             others = join_words(rivals, "or") or "another law that fits as well"
+            if any(it.where is not None for it in diagnosis.effects) and _OF_LINEAR_PART.issuperset(
+                diagnosis.ambiguous_with
+            ):
+                parts = [_direction(item) for item in diagnosis.linear if _differs(item)]
+                either = f"{either} missing; {join_words(parts, 'and')}"
             return f"{capital(either)}, or {others}"
         case _:
             pass
