@@ -67,7 +67,7 @@ def diagnose(
     spec = load_named_model(model, Path())
     if not as_json:
         print_text(
-            "Searching for what the model lacks: usually half a minute to 5 minutes for each "
+            "Searching for what the model lacks: usually ten seconds to three minutes for each "
             "minute of recordings that it learns from. Ctrl-C ends the search; nothing is written "
             "then."
         )

@@ -104,11 +104,6 @@ def _notes_of_search(
             "In these data a gain of the applied force is indistinguishable from a change of mass, "
             "stiffness and damping in one proportion. Weigh the mass to separate the two."
         )
-    if len(search.chosen.fit.candidate.new) > 1:
-        notes.append(
-            "Several effects act together: fewer than 95 % of such intervals contain the true "
-            "value. The diagnosis of another run shows by how much the values differ."
-        )
     has_mass = any(p.kind == "mass" for p in free_parameters(problem, search.chosen.fit))
     if has_mass and problem.is_driven_by_force and not search.gain_alike:
         notes.append(
