@@ -116,7 +116,7 @@ def _check_recordings(
         for title, rows in texts.recordings(found):
             print_table(("", ""), rows, title)
         if rows := texts.delays(found):
-            heads = ("channel", "seems late by", "standard deviation")
+            heads = ("channel", "estimated delay", "standard deviation")
             print_table(heads, rows, "Delays, if the model lacks no law")
         heads = ("parameter", "strut", "nominal", "known to", "model file", "varies with")
         print_table(heads, texts.linear(found), "Linear part, standard deviations")

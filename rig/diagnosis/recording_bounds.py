@@ -45,7 +45,7 @@ class RecordingFacts:
 
 @dataclass(frozen=True)
 class DelayBound:
-    """By how much a channel seems late, if the model lacks no law.
+    """Estimated delay of a channel, if the model lacks no law.
 
     Attributes:
         channel: As in ``channels`` of a diagnosis.

@@ -56,7 +56,7 @@ def linear(found: Determinable) -> tuple[Row, ...]:
 
 
 def delays(found: Determinable) -> tuple[Row, ...]:
-    """Channel, by how much it seems late, and the standard deviation of that."""
+    """Channel, its estimated delay, and the standard deviation of that."""
     return tuple(
         (it.channel, quantity(it.delay_s, "s"), quantity(it.std_s, "s")) for it in found.delays
     )

@@ -75,13 +75,13 @@ def measure(slot: Slot, out: Path) -> Measured:
         "--out", folder / "found", "--json",
     ]  # fmt: skip
     begin = time.perf_counter()
-    with (folder / "said.txt").open("w", encoding="utf-8") as said:
-        child = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+    with (folder / "output.txt").open("w", encoding="utf-8") as output:
+        child = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         _, status, used = os.wait4(child.pid, 0)
     wall_s = time.perf_counter() - begin
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode != 0:
-        raise SystemExit(f"{slot.name}: rig diagnose failed, see {folder / 'said.txt'}")
+        raise SystemExit(f"{slot.name}: rig diagnose failed, see {folder / 'output.txt'}")
     found = json.loads((folder / "found" / "diagnosis.json").read_text("utf-8"))
     names = tuple(effect["name"] for effect in found["effects"])
     cpu_s = used.ru_utime + used.ru_stime

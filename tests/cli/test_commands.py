@@ -251,9 +251,9 @@ def test_a_diagnosis_prints_the_gains_of_its_corrected_model_for_the_run(
     (settings,) = yaml.safe_load("".join(lines)).values()
     source, plan = case_folder / "run", plan_of_run(case_folder / "run", load_model(model))
     (tuned,) = tune(plan, source, "kalman", Aim(), no_progress)
-    wanted = settings_of(tuned.tuned.observer)
-    assert settings["kind"] == wanted["kind"] == "kalman"
-    assert settings["filter"] == pytest.approx(wanted["filter"], rel=1e-3)
+    expected = settings_of(tuned.tuned.observer)
+    assert settings["kind"] == expected["kind"] == "kalman"
+    assert settings["filter"] == pytest.approx(expected["filter"], rel=1e-3)
 
 
 def test_a_run_that_is_held_out_too_is_refused(

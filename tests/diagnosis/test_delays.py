@@ -64,7 +64,7 @@ def test_a_delay_that_a_fit_left_at_an_end_is_searched_for_beyond_it(value_s, en
     late = LinearParameter(
         0, "delay", 0.0, 2e-3, 9.6e-3, channel="height_m:strut", most=11.6e-3, expected=10.6e-3
     )
-    problem = Beside(linear=(late, late._replace(kind="mass")))
+    problem = LinearPart(linear=(late, late._replace(kind="mass")))
     found, mass = search_delays_beyond(problem, np.array([value_s, value_s])).linear
     assert (found.least, found.most) == pytest.approx(ends_s)
     assert found.expected == late.expected
@@ -72,8 +72,8 @@ def test_a_delay_that_a_fit_left_at_an_end_is_searched_for_beyond_it(value_s, en
 
 
 @dataclass(frozen=True)
-class Beside:
-    """What a problem has of linear parameters."""
+class LinearPart:
+    """The linear parameters of a problem."""
 
     linear: tuple[LinearParameter, ...]
 

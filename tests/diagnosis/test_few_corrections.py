@@ -39,14 +39,14 @@ def test_corrections_that_differ_from_zero_stay_alone(monkeypatch):
 
 
 def with_gain(mass):
-    """Corrections of a bench whose force is said to be a fifth smaller than it is.
+    """Corrections where the recorded force is a quarter larger than that of the model's bench.
 
     All is then a quarter larger than in the model file, but for what is missing of the mass.
     """
-    told = bench.run(bench.Nothing(), noise_m=1e-5, duration_s=8.0)
+    record = bench.run(bench.Nothing(), noise_m=1e-5, duration_s=8.0)
     known = {"mass": mass / 1.25, "stiffness": bench.STIFFNESS / 1.25}
     model = bench.model(damping=bench.DAMPING / 1.25, gravity=0.0, **known)
-    problem = build(model, [told], 32, None)
+    problem = build(model, [record], 32, None)
     given, linear = first_fits(problem)
     pool = Pool(problem, given, [linear], CRITERIA)
     few = model_selection._with_few_corrections(pool, pool.linear)

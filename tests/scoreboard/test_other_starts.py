@@ -13,9 +13,8 @@ from rig.recordings.read import read_recording
 from tests.diagnosis.answers import overlap
 from tests.scoreboard.parts import Part, imported
 from tests.scoreboard.starts import dyno_start, one_body
+from tests.scoreboard.test_scoreboard import SHARED
 
-# Measured data lie beside the checkout, never in it.
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 DAMPER, STAGE = SHARED / "mr_damper" / "5mm3Hz1A.txt", SHARED / "emps"
 
 

@@ -16,7 +16,7 @@ from dart_model.effects.hysteresis import MAXWELL
 from rig.diagnosis.problem.channel_delays import is_undetermined, search_undetermined
 from rig.diagnosis.problem.problem import strut_constants
 from rig.diagnosis.problem.track import law_force
-from rig.diagnosis.search.fit import fit, model_for
+from rig.diagnosis.search.fit import Fit, fit, model_for
 from rig.diagnosis.search.pool import FINAL, Pool, ValidatedModel
 from rig.diagnosis.search.screen import law_starts
 from rig.diagnosis.search.validity import is_linear_along
@@ -52,6 +52,13 @@ def _rivals_of_one_frequency(pool: Pool, chosen: ValidatedModel) -> tuple[Valida
     return tuple(rival for rival in rivals if rival is not None)
 
 
+def _as_good(pool: Pool, chosen: ValidatedModel, result: Fit | None) -> ValidatedModel | None:
+    """A fit with its cross-validation; None where the chosen model is preferred to it."""
+    if result is None or pool.prefers(chosen, rival := pool.validate(result)):
+        return None
+    return rival
+
+
 def _with_delays_instead(
     pool: Pool, chosen: ValidatedModel, corrected: Sequence[int], unknown: Sequence[int]
 ) -> ValidatedModel | None:
@@ -61,8 +68,7 @@ def _with_delays_instead(
         linear, free = chosen.fit.parts.linear.copy(), chosen.fit.free.copy()
         linear[list(dropped)], free[list(dropped)], free[list(unknown)] = 0.0, False, True
         first = chosen.fit.model.with_linear(linear)
-        result = fit(problem, first, free, FINAL)
-        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
+        if rival := _as_good(pool, chosen, fit(problem, first, free, FINAL)):
             return rival
     return None
 
@@ -81,8 +87,7 @@ def _with_memory_instead(
     plain = chosen.fit.model.with_linear(linear)
     for start in MAXWELL.starts(pool.problem.motions[strut]):
         first = model_for(pool.problem, plain, candidate, {law: np.array(start)})
-        result = fit(pool.problem, first, free, FINAL)
-        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
+        if rival := _as_good(pool, chosen, fit(pool.problem, first, free, FINAL)):
             return rival
     return None
 
@@ -125,7 +130,6 @@ def _with_friction_instead(pool: Pool, chosen: ValidatedModel, strut: int) -> Va
         linear[dropped], free[dropped] = 0.0, False
         plain = chosen.fit.model.with_linear(linear)
         first = model_for(problem, plain, candidate, {law: starts[0]})
-        result = fit(problem, first, free, FINAL)
-        if result is not None and not pool.prefers(chosen, rival := pool.validate(result)):
+        if rival := _as_good(pool, chosen, fit(problem, first, free, FINAL)):
             return rival
     return None

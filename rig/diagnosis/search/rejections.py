@@ -90,15 +90,15 @@ def _in_simulation(
             return left, "without any law the residual is at the noise floor"
         return left, _too_little(source, model)
     ratio = f"{left / least:.3f}" if left < _NEAR * least else f"{left / least:.3g}"
+    is_plainer = len(model.fit.parts.effects) <= len(chosen.fit.parts.effects)
+    more = "" if is_plainer else ", with more parameters"
     if left < least / _SAME:
-        more = len(model.fit.parts.effects) > len(chosen.fit.parts.effects)
         return left, (
             f"its residual is {ratio} times that of the chosen model, which differs by no more "
-            f"than chance{', and it has more parameters' if more else ''}"
+            f"than chance{more}"
         )
     if left < _SAME * least:
-        is_plainer = len(model.fit.parts.effects) <= len(chosen.fit.parts.effects)
-        return left, f"it fits no better{'' if is_plainer else ', with more parameters'}"
+        return left, f"it fits no better{more}"
     alone = "alone, " if chosen.size > 1 else ""
     return left, f"{alone}its residual is {ratio} times that of the chosen model"
 
