@@ -27,6 +27,8 @@ from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem.build import build_without_delays
 from rig.diagnosis.problem.channel_delays import SIGNIFICANT
 from rig.diagnosis.problem.delay_estimate import LEAST_WIDTH_S, estimate_delays
+from rig.diagnosis.problem.fmu_force import forces_along
+from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.linear_part import PARAMETERS
 from rig.diagnosis.problem.problem import Problem, rms
 from rig.diagnosis.problem.track import segment_forces, strut_forces
@@ -78,6 +80,7 @@ def find_determinable(spec: ModelSpec, recordings: Sequence[Recording]) -> Deter
     ]
     along = [
         strut_forces(problem, given.model, track, problem.states(k, given.model))
+        + _fmu_forces(problem, track)
         for k, track in tracks
     ]
     signals = [
@@ -91,6 +94,15 @@ def find_determinable(spec: ModelSpec, recordings: Sequence[Recording]) -> Deter
     gaps = tuple(run.gaps.report(run.name) for run in recordings if run.gaps)
     delays = _delay_bounds(problem)
     return Determinable(tuple(facts), _linear_bounds(stage), families, unexcited, delays, gaps)
+
+
+def _fmu_forces(problem: Problem, track: Track) -> Array:
+    """Forces of FMUs along a motion, shape (struts, N)."""
+    forces_n = np.zeros_like(track.heights_m)
+    for strut, mockup in enumerate(problem.plants.plain.mockups):
+        if mockup is not None:
+            forces_n[strut], _, _ = forces_along(mockup, strut, track)
+    return forces_n
 
 
 def _delay_bounds(problem: Problem) -> tuple[DelayBound, ...]:
