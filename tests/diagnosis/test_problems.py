@@ -1,13 +1,14 @@
 """Every kind of problem answers the whole protocol, and its answers fit together."""
 
 import inspect
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dart_model.effects import CATALOGUE
-from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.diagnose import first_fits, with_noise_of_least_force
 from rig.diagnosis.estimates import FitEstimates
 from rig.diagnosis.evaluate import evaluate_held_out
 from rig.diagnosis.problem.build import (
@@ -176,3 +177,21 @@ def test_a_parameter_that_changes_nothing_has_no_interval():
     blind = linear._replace(solution=solution._replace(jacobian=jacobian, prior=prior))
     unknown = FitEstimates(blind, fit_covariance(blind)).estimate(0)
     assert (unknown.value, unknown.low, unknown.high) == (known.value, None, None)
+
+
+class Hum(little_bench.Nothing):
+    def force(self, t, z, v, state):
+        return 4.0 * math.cos(2.0 * math.pi * 5.3 * t)
+
+
+@pytest.mark.parametrize("is_given_nearer", [True, False])
+def test_tones_are_those_of_the_least_residual_force(is_given_nearer):
+    """A fit may match the heights better by a mass that is far too large: its force does not."""
+    problem = build_without_delays(little_bench.model(), [little_bench.run(Hum())], 32, None)
+    given, linear = first_fits(problem)
+    mass = np.array([20.0 * (parameter.kind == "mass") for parameter in problem.linear])
+    heavy = linear._replace(model=linear.model.with_linear(mass))
+    fits = (given, heavy) if is_given_nearer else (heavy, linear)
+    (motion,) = with_noise_of_least_force(problem, fits).motions
+    assert motion.tones[0][0] == pytest.approx(5.3, rel=0.01)
+    assert motion.force_n < 4.0

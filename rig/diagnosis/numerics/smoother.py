@@ -12,6 +12,7 @@ References:
     concentrated likelihood.
 """
 
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,10 @@ _SLOWER, _FASTER = 2.5, 7.0
 _AS_LIKELY = 2.0
 """Twice the log likelihood by which a smoother signal may be less likely."""
 _LONGEST_FOR_LIKELIHOOD = 12_000
+_DIFFERENCES = 4
+_STRIDES = (1, 2, 3)
+_NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a normal variable of unit variance."""
 
 
 class Smoothed(NamedTuple):
@@ -258,6 +263,26 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     log_ratio = float(optimum.x)
     squares, _, count = sums(log_ratio)
     return Noise(squares / count, float(np.exp(log_ratio)))
+
+
+def estimate_noise_beside_jumps(y: Array) -> float:
+    """Standard deviation of the noise of a signal (N,) that jumps, in samples of equal distance.
+
+    Jumps are no random walk: by likelihood they count as noise. Of differences of fourth order a
+    smooth signal has almost none, and a jump spoils five of them: the median is that of the noise
+    (Hall, Kay and Titterington, Asymptotically optimal difference-based estimation of variance,
+    Biometrika 77, 1990). The largest of those of every sample, every second and every third is
+    taken, between which coloured noise grows; values that are held count once.
+    """
+    fresh = y[np.diff(y, prepend=np.nan) != 0.0]
+    gain = _NORMAL_MEDIAN * np.sqrt(comb(2 * _DIFFERENCES, _DIFFERENCES))
+    estimates = [0.0]
+    for stride in _STRIDES:
+        phases = [np.diff(fresh[first::stride], _DIFFERENCES) for first in range(stride)]
+        differences = np.abs(np.concatenate(phases))
+        if len(differences):
+            estimates.append(float(np.median(differences)) / gain)
+    return max(estimates) or np.inf
 
 
 def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:

@@ -16,7 +16,12 @@ from scipy.interpolate import CubicHermiteSpline
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.delay_step import ForceOverTime
-from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.diagnosis.numerics.smoother import (
+    Smoothed,
+    estimate_noise,
+    estimate_noise_beside_jumps,
+    smooth,
+)
 from rig.diagnosis.outcome import HeldOutSeries, ModelErrors, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.channel_delays import delays_of, known_share
@@ -55,6 +60,8 @@ Array = NDArray[np.float64]
 _UNCERTAIN = 1.5
 """Times its median from which on the deviation of the smoothed velocity is that of a recording's
 end, where nothing follows to smooth with."""
+_CERTAIN_SIGN = 4.0
+"""Its deviations from zero from which on the sign of a velocity or an acceleration is certain."""
 _DRAWS = 3
 """Draws of the motion's noise for a floor: the third changes it by a few percent."""
 _LEAST_SWING = 5.0
@@ -72,7 +79,7 @@ class DynoRun(NamedTuple):
         courses: Height of each strut over time, also where this is a part of a recording.
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
         cell_rates_n_per_s: Their smoothed rates of change, shape (struts, N).
-        certain: Nodes at which the motion is well known, shape (N,).
+        certain: Nodes at which the motion is well known and does not turn, shape (N,).
         height_noise_m: Standard deviation of each height's noise, shape (struts,).
         velocity_noise_m_per_s: Standard deviation of each smoothed velocity, shape (struts,).
         cell_noise_n: Standard deviation of each load cell's noise, shape (struts,).
@@ -128,7 +135,7 @@ def dyno_run(smooth_recording: SmoothRecording) -> DynoRun:
         if measured is not None and np.all(np.isfinite(measured[:, i])):
             cells[i] = np.interp(grid.t_s, grid.t_s[sample_nodes], measured[:, i])
             noise = estimate_noise(grid.t_s, cells[i])
-            noise_n[i] = np.sqrt(noise.variance)
+            noise_n[i] = min(np.sqrt(noise.variance), estimate_noise_beside_jumps(measured[:, i]))
             rates[i] = smooth(grid.t_s, cells[i] - cells[i].mean(), noise).states[:, 1]
     rows = zip(motion.heights_m, motion.velocities_m_per_s, strict=True)
     return DynoRun(
@@ -137,11 +144,25 @@ def dyno_run(smooth_recording: SmoothRecording) -> DynoRun:
         tuple(CubicHermiteSpline(grid.t_s, z, w) for z, w in rows),
         cells,
         rates,
-        np.all(spread < _UNCERTAIN * np.median(spread, axis=1, keepdims=True), axis=0),
+        np.all([_is_certain(state) for state in states], axis=0),
         np.sqrt([noise.variance for noise in noises]),
         np.median(spread, axis=1),
         noise_n,
     )
+
+
+def _is_certain(state: Smoothed) -> Flags:
+    """Nodes (N,) at which a strut's velocity is well known, and its sign as well.
+
+    At a turn an error of velocity is one of friction's sign, which other laws would take for their
+    own. At rest there is no turn.
+    """
+    _, velocity, acceleration, _ = state.states.T
+    _, velocity_std, acceleration_std, _ = state.deviations.T
+    is_turning = (np.abs(velocity) < _CERTAIN_SIGN * velocity_std) & (
+        np.abs(acceleration) > _CERTAIN_SIGN * acceleration_std
+    )
+    return (velocity_std < _UNCERTAIN * np.median(velocity_std)) & ~is_turning
 
 
 def cell_residual_std(spec: ModelSpec, runs: Sequence[DynoRun]) -> Array:
