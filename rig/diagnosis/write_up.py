@@ -236,9 +236,9 @@ def _evidence(
     """The evidence for each chosen law."""
     shown = confirmations(evaluations, search, laws, criteria)
     return {
-        law: Evidence(*search.evidence[law], shown[law], 0.5 * found.gain)
+        law: Evidence(gains.without, gains.rival, shown[law], 0.5 * found.gain)
         for law, found in laws.items()
-        if law in search.evidence
+        if (gains := search.evidence.get(law)) is not None
     }
 
 

@@ -2,6 +2,7 @@
 
 import inspect
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from rig.cli.diagnose import diagnose as command
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, LikelihoodGain
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.evidence import LeftOutGains
+from rig.diagnosis.search.evidence import LeftOutGains, are_by_chance
 from rig.diagnosis.search.pool import error_ratio
 from tests.cli.test_commands import rig
 from tests.diagnosis import little_bench as bench
@@ -54,6 +55,27 @@ def test_a_gain_in_all_blocks_is_no_chance_and_its_ratio_is_that_of_the_residual
 
 def gains(ratio):
     return LeftOutGains(LikelihoodGain((), 5.0, Estimate(*ratio)), None)
+
+
+@pytest.mark.parametrize("is_far", [False, True])
+def test_beyond_some_floors_a_candidate_needs_to_be_better_than_by_chance_by_itself(is_far):
+    """Level 1 %; of many laws one in a thousand gains that much."""
+    law, without = draw(np.random.default_rng(2), 0.21, scatter=0.02)
+    surely = gains(error_ratio(without, law, 1e-4))
+    perhaps = LeftOutGains(LikelihoodGain((), 4.0, Estimate(1.1, 0.99, 1.2)), None, True)
+    hardly = perhaps._replace(is_better=False)
+    floors = 1.01 * CRITERIA.settled if is_far else 0.99 * CRITERIA.settled
+    pool = SimpleNamespace(criteria=CRITERIA, floor=lambda _: 1000.0)
+    chosen = SimpleNamespace(cost=floors**2 * 1000.0)
+
+    def by_chance(*each):
+        return are_by_chance(pool, chosen, dict(enumerate(each)))
+
+    assert not by_chance(surely)
+    assert by_chance(surely, perhaps) is not is_far
+    assert by_chance(perhaps, surely) is not is_far
+    assert by_chance(surely, hardly)
+    assert by_chance(perhaps)
 
 
 def test_what_happens_once_may_be_chance():

@@ -7,7 +7,7 @@ References:
     laws gains by chance what one of them would at the level over their number.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dart_model.effects import effect
@@ -19,14 +19,19 @@ from rig.diagnosis.search.screen import candidate_laws
 
 
 class LeftOutGains(NamedTuple):
-    """Gains by a law: over the best model of the others, and over the best without its family."""
+    """Gains by a law: over the best model of the others, and over the best without its family.
+
+    Attributes:
+        is_better: Whether one law alone gains less by chance, at the level of the criteria.
+    """
 
     without: LikelihoodGain
     rival: LikelihoodGain | None
+    is_better: bool = True
 
     @property
     def is_by_chance(self) -> bool:
-        """Whether chance gains as much, at the level of the criteria."""
+        """Whether the best of all laws gains as much by chance, at the level of the criteria."""
         low = self.without.error_ratio.low
         return low is None or low <= 1.0
 
@@ -40,6 +45,20 @@ def weigh_laws(
     along the motion first.
     """
     return {law: _weigh(pool, first, single, chosen, law) for law in chosen.fit.candidate.new}
+
+
+def are_by_chance(
+    pool: Pool, chosen: ValidatedModel, evidence: Mapping[StrutEffect, LeftOutGains]
+) -> bool:
+    """Whether chance gains as much as one of a model's laws.
+
+    Beyond some times the noise floor no law is named but the one that the data need most: the
+    others are candidates, which predict better, but for one by itself that does so by chance.
+    """
+    gains = sorted(evidence.values(), key=lambda it: it.without.log_likelihood, reverse=True)
+    if chosen.cost <= pool.criteria.settled**2 * pool.floor(chosen):
+        return any(it.is_by_chance for it in gains)
+    return any(it.is_by_chance for it in gains[:1]) or not all(it.is_better for it in gains)
 
 
 def _weigh(
@@ -69,6 +88,7 @@ def _weigh(
     return LeftOutGains(
         _gain(chosen, least, level / len(candidate_laws(pool.problem))),
         None if rival is None else _gain(chosen, rival, level),
+        error_ratio(least, chosen, level).low > 1.0,
     )
 
 

@@ -23,7 +23,7 @@ from rig.diagnosis.problem.problem import (
     strut_constants,
 )
 from rig.diagnosis.progress import Progress
-from rig.diagnosis.search.evidence import LeftOutGains, weigh_laws
+from rig.diagnosis.search.evidence import LeftOutGains, are_by_chance, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel, adds_an_imitator
@@ -136,7 +136,7 @@ def select_model(
             _attempt_plainer(pool, chosen)
             continue
         evidence = weigh_laws(pool, first, single, chosen)
-        if any(gains.is_by_chance for gains in evidence.values()):
+        if are_by_chance(pool, chosen, evidence):
             pool.reject(chosen.fit.candidate, _BY_CHANCE.format(pool.criteria.level))
             most_laws = chosen.size - 1
             continue
