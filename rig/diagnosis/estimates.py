@@ -19,7 +19,14 @@ from rig.diagnosis.problem.problem import (
 )
 from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import UNBOUND, Fit, FitCovariance, effect_variables, law_values
+from rig.diagnosis.search.fit import (
+    CLOCK,
+    UNBOUND,
+    Fit,
+    FitCovariance,
+    effect_variables,
+    law_values,
+)
 
 Array = NDArray[np.float64]
 
@@ -27,9 +34,6 @@ _NEARLY = 0.02
 """Share of a preload up to which it counts as implied by a change of stiffness."""
 AT_BOUND = 1e-3
 """Distance from the end of a range, relative, within which a parameter counts as at it."""
-_CLOCK = 5e-5
-"""Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
-run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
 
 
 class FitEstimates(NamedTuple):
@@ -53,12 +57,12 @@ class FitEstimates(NamedTuple):
         if space.logarithmic[variable]:
             if half > np.log(UNBOUND):
                 return Estimate(value, None, None)
-            growth = float(np.exp(np.hypot(half, _CLOCK)))
+            growth = float(np.exp(np.hypot(half, CLOCK)))
             return Estimate(value, max(value / growth, low), min(value * growth, high))
         half *= float(space.scale[variable])
         if half > UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
             return Estimate(value + nominal, None, None)
-        half = float(np.hypot(half, _CLOCK * abs(value + nominal)))
+        half = float(np.hypot(half, CLOCK * abs(value + nominal)))
         return Estimate(
             value + nominal, max(value - half, low) + nominal, min(value + half, high) + nominal
         )

@@ -45,7 +45,8 @@ def confirmations(
     Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
     it whatever it is: at most the one that the data need most is confirmed. What is left may be due
     to its formula then, so that its family has to have others: a periodic force has none. Two laws
-    of a strut that are functions of its height alone are one curve, whose parts are not confirmed.
+    of a strut that are functions of its height alone, or two stops, are one curve, whose parts are
+    not confirmed.
     """
     found: dict[StrutEffect, Confirmation] = {
         law: confirmation(it, criteria) for law, it in laws.items()
@@ -57,7 +58,7 @@ def confirmations(
     by_need = sorted(gains, key=gains.__getitem__, reverse=True)
     if ratio <= criteria.settled:
         settled = set(found) - _further_curves(by_need)
-    elif by_need and _share_left(evaluations, criteria) < criteria.leading:
+    elif by_need and _largest_share_left(evaluations, criteria) < criteria.leading:
         settled = {law for law in by_need[:1] if _may_be_named_alone(law, by_need)}
     else:
         settled = set[StrutEffect]()
@@ -85,9 +86,17 @@ def _has_other_formulas(name: str) -> bool:
 
 
 def _is_part_of_curve(law: StrutEffect, laws: Iterable[StrutEffect]) -> bool:
-    """Whether a law and another one of its strut are both functions of the height alone."""
-    curves = [it for it in laws if it[0] == law[0] and reads_alone(it[1], "height_m")]
-    return law in curves and len(curves) > 1
+    """Whether a law and another one of its strut are one curve over the height.
+
+    Both are functions of the height alone, or both of one family, as two stops are.
+    """
+    family, is_curve = effect(law[1]).family, reads_alone(law[1], "height_m")
+    return any(
+        (family in OVER_HEIGHT and effect(it[1]).family == family)
+        or (is_curve and reads_alone(it[1], "height_m"))
+        for it in laws
+        if it[0] == law[0] and it != law
+    )
 
 
 def find_reason_against_laws(
@@ -152,6 +161,16 @@ def _share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteri
         return share
     force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
     return min(share, _divide(force.after, force.linear))
+
+
+def _largest_share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria) -> float:
+    """The share of the error that is left, and of the residual force, whichever is larger.
+
+    Laws that stand in for another fit heights, which are smooth, rather than the force.
+    """
+    force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
+    left = _share_left(evaluations, criteria), _divide(force.after, force.linear)
+    return float(np.nanmax(left))
 
 
 def _over_floor(evaluations: Sequence[RunEvaluation]) -> list[float]:

@@ -1,6 +1,9 @@
 """Which linear corrections a model keeps."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build
@@ -75,3 +78,17 @@ def test_a_gain_that_takes_the_mass_farther_is_a_rival_of_corrections_in_one_pro
 
 def test_a_correction_that_is_zero_once_others_are_gone_goes_too(monkeypatch):
     assert corrections(monkeypatch, first=("mass", "stiffness")) == {"damping"}
+
+
+@pytest.mark.parametrize(("share", "is_kept"), [(6e-5, True), (4e-5, False)])
+def test_a_correction_that_is_finer_than_a_clock_is_none(monkeypatch, share, is_kept):
+    """Crystals are right to 50 ppm."""
+    problem = build(bench.model(), [bench.run(bench.Nothing(), duration_s=8.0)], 32, None)
+    linear = np.array([share * p.nominal if p.kind == "mass" else 1.0 for p in problem.linear])
+    result = SimpleNamespace(parts=SimpleNamespace(linear=linear))
+    monkeypatch.setattr(model_selection, "_significant_parameters", lambda *_: linear != 0.0)
+    pool = SimpleNamespace(problem=problem, criteria=CRITERIA)
+    kept = model_selection._significant_corrections(pool, result)
+    assert {p.kind for p, free in zip(problem.linear, kept, strict=True) if not free} == (
+        set() if is_kept else {"mass"}
+    )

@@ -95,7 +95,7 @@ def test_where_heights_drift_the_force_decides():
 MORE, OTHER = (0, "end_stops"), (0, "backlash")
 
 
-def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW)):
+def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW), after_n=0.25):
     """What held-out data show of laws that they confirm, of which they need the first one most."""
 
     evidence = {
@@ -103,7 +103,7 @@ def shown(after_m, linear_m=1e-1, laws=(OTHER, MORE, LAW)):
         for law, gain in zip(laws, (9e5, 3e4, 2e3), strict=False)
     }
     found = confirmations(
-        [evaluation(after_m, linear_m)],
+        [evaluation(after_m, linear_m, after_n)],
         SimpleNamespace(evidence=evidence),
         dict.fromkeys(laws, CONFIRMED),
         CRITERIA,
@@ -136,11 +136,17 @@ def test_far_above_the_floor_parts_of_one_curve_are_not_named():
     assert shown(40.0 * FLOOR_M, laws=(spring, OTHER)) == ["unsettled"] * 2
     assert shown(40.0 * FLOOR_M, laws=(spring, (1, "backlash"))) == ["confirmed", "unsettled"]
     assert shown(40.0 * FLOOR_M, laws=(LAW, spring, OTHER))[0] == "confirmed"
+    stops = (0, "power_bump_stop"), (0, "power_rebound_stop")
+    assert shown(40.0 * FLOOR_M, laws=stops) == ["unsettled"] * 2
     assert shown(4.5 * FLOOR_M, laws=(spring, OTHER)) == ["confirmed", "unsettled"]
 
 
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
-    assert shown(40.0 * FLOOR_M, linear_m=1.2e-3) == ["unsettled"] * 3
+    assert shown(40.0 * FLOOR_M, after_n=0.35) == ["unsettled"] * 3
+    assert shown(4.5 * FLOOR_M, after_n=0.35, laws=(LAW,)) == ["confirmed"]
+    # Heights drift: where they are about as far off, the force decides.
+    assert shown(40.0 * FLOOR_M, linear_m=34.0 * FLOOR_M, laws=(LAW,)) == ["confirmed"]
+    assert shown(40.0 * FLOOR_M, linear_m=33.0 * FLOOR_M, laws=(LAW,)) == ["unsettled"]
 
 
 def test_what_held_out_data_do_not_exercise_stays_so_far_above_the_floor():

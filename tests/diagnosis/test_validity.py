@@ -84,3 +84,25 @@ def test_a_law_with_memory_does_not_replace_the_spring_but_a_spring_does():
     assert reason((0.0, -1900.0, 0.0), "maxwell") is not None
     assert reason((0.0, -1900.0, 0.0), "gas_spring") is None
     assert reason((0.0, 1900.0, 0.0), "gas_spring") is not None
+
+
+@pytest.mark.parametrize(
+    ("left", "linear_left", "is_linear"),
+    [(1.0, 4.0, False), (1.0, 1.4, True), (1.3, 4.0, True)],
+    ids=["at floor alone", "as the linear model", "not at floor"],
+)
+def test_a_law_that_is_linear_to_half_a_percent_is_one_where_only_it_reaches_the_floor(
+    left, linear_left, is_linear
+):
+    """Of `explained`: 1.2 floors, 1.44 in the mean square."""
+    z = 0.3 + 0.02 * np.sin(T_S)
+    along = [track(height_m=z)._replace(velocities_m_per_s=0.02 * np.cos(T_S)[np.newaxis])]
+    force_n = 300.0 - 8000.0 * (z - 0.3) + 0.1 * np.sin(3.0 * T_S)
+    candidate = SimpleNamespace(kept=(), new=((0, "gas_spring"),))
+    fits = tuple(
+        SimpleNamespace(candidate=candidate, model=None, mean_square=it)
+        for it in (left, linear_left)
+    )
+    problem = SimpleNamespace(floor_level=lambda _: 1.0)
+    why = validity._find_linear_law(problem, fits, [(0, force_n)], along, CRITERIA)
+    assert (why is not None) == is_linear

@@ -72,8 +72,9 @@ class SelectionCriteria:
             tenth of a deviation): one in some ten thousand is as far off (Gauss), so that the laws
             are the likelier error.
         leftover: Least share of a law's force along the motion that no change of the linear part
-            replaces; with less the law is a linear correction. A force is seldom known to
-            less (class 0.5 of ISO 7500-1 is half a percent).
+            replaces; with less the law is a linear correction, unless it is at the noise floor and
+            the best linear model is not. A force is seldom known to less (class 0.5 of ISO 7500-1
+            is half a percent).
         passive: Share of the largest dissipated power that a corrected strut may feed in, a
             tolerance for the rounding of a fit.
         dissipating_to: Multiple of the largest recorded velocity up to which a corrected strut has
@@ -89,10 +90,10 @@ class SelectionCriteria:
             Beyond it a further law may stand in for what the formula of another lacks: of partial
             explanations by several laws in the method's development, right ones left 3.4 times the
             floor at most, and those with a false further name 6 times and more, but for one.
-        leading: Share of the best linear model's error on held-out data that a model beyond that
-            may leave for its first name to be believed: in the same cases a false one left a third
-            and more, right ones a tenth or less; the measured stage EMPS leaves a quarter of the
-            force beside its friction.
+        leading: Share of the best linear model's error on held-out data, and of its residual force,
+            that a model beyond that may leave for its first name to be believed: in the same cases
+            a false one left a third and more, right ones a tenth or less; the measured stage EMPS
+            leaves a quarter of the force beside its friction.
         partly: Share by which laws have to reduce the RMS error of the best linear model on
             held-out data to be a partial explanation.
         white: Level of the whiteness test.

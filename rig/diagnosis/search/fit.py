@@ -420,6 +420,9 @@ def start_variables(problem: Problem, result: Fit) -> Flags:
     return flags
 
 
+CLOCK = 5e-5
+"""Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
+run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
 UNBOUND = 30.0
 """Factor, or multiple of a value, from which on a parameter is not identifiable."""
 

@@ -25,7 +25,7 @@ from rig.diagnosis.problem.problem import (
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.evidence import LeftOutGains, are_by_chance, weigh_laws
 from rig.diagnosis.search.explore import FirstRound
-from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
+from rig.diagnosis.search.fit import CLOCK, Fit, fit, fit_covariance, law_values, model_for
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, ValidatedModel, adds_an_imitator
 from rig.diagnosis.search.poor_motions import rivals_of_poor_motion, springs_and_dampers
 from rig.diagnosis.search.rejections import list_rejections, residual_left
@@ -475,8 +475,14 @@ def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> Validat
 
 
 def _significant_corrections(pool: Pool, result: Fit) -> Flags:
-    """Which of a fit's linear parameters a model keeps, shape (L,)."""
+    """Which of a fit's linear parameters a model keeps, shape (L,).
+
+    A correction that is finer than a clock is none.
+    """
     significant = _significant_parameters(result, pool.criteria.significant)
+    nominals = np.array([p.nominal for p in pool.problem.linear])
+    corrections = result.parts.linear
+    significant &= np.abs(corrections) > CLOCK * np.abs(nominals + corrections)
     # Where the data do not show a delay, spring and damper are known no better than it.
     for i, p in enumerate(pool.problem.linear):
         significant[i] |= is_undetermined(p) and bool(springs_and_dampers(pool, significant))

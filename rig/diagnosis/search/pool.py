@@ -413,8 +413,8 @@ class Pool:
             return
         self.fits[candidate] = model
         self.invalid.pop(candidate, None)
-        linear = self.fits.get(nominal(self.problem), model).fit.parts.linear
-        why = find_defect(self.problem, model.fit, linear, self.along, self.criteria)
+        lawless = self.fits.get(nominal(self.problem), model).fit
+        why = find_defect(self.problem, model.fit, lawless, self.along, self.criteria)
         if why is not None:
             self.invalid[candidate] = why
 

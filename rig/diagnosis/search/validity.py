@@ -72,23 +72,23 @@ def smooth_tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
 def find_defect(
     problem: Problem,
     result: Fit,
-    lawless: Array,
+    lawless: Fit,
     motions: Sequence[tuple[int, Track]],
     criteria: SelectionCriteria,
 ) -> str | None:
     """The reason for which a model is not used; None where there is none.
 
-    `lawless` are the corrections of the best linear model, shape (L,).
+    `lawless` is the best linear model.
     """
     forces = forces_along(problem, result.model, motions)
     along = [track for _, track in motions]
     return (
         _find_unbounded_law(problem, result, criteria)
-        or _find_linear_law(result, forces, along, criteria)
+        or _find_linear_law(problem, (result, lawless), forces, along, criteria)
         or _find_cancelling_laws(result, forces, criteria)
         or _find_active_strut(problem, result, along, criteria)
         or find_improbable_linear_part(
-            problem, result.candidate.new, result.parts.linear, lawless, criteria
+            problem, result.candidate.new, result.parts.linear, lawless.parts.linear, criteria
         )
         or _find_harmonic_of_drive(result, along, law_values(problem, result))
     )
@@ -156,12 +156,21 @@ def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
 
 
 def _find_linear_law(
-    result: Fit,
+    problem: Problem,
+    fits: tuple[Fit, Fit],
     forces: list[tuple[int, Array]],
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    """Reason against a law that is a linear spring and damper along this motion."""
+    """Reason against a law that is a linear spring and damper along this motion.
+
+    Unless it is at the noise floor, and the linear model, the second of the fits, is not.
+    """
+    result, lawless = fits
+    floor = problem.floor_level(result.model)
+    is_at_floor = result.mean_square <= (1.0 + criteria.least_above_noise_later) * floor
+    if is_at_floor and lawless.mean_square > criteria.explained**2 * floor:
+        return None
     for row, name in new_laws(result):
         strut, force_n = forces[row]
         if is_linear_along(along, strut, force_n, criteria):
