@@ -41,6 +41,7 @@ from rig.diagnosis.recording_bounds import (
 )
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.screen import Stage, candidate_laws, law_starts, responses, stage_of
+from rig.diagnosis.search.validity import smooth_tracks
 from rig.recordings.recording import Recording
 from rig.recordings.stretches import find_stretches
 
@@ -73,11 +74,7 @@ def find_determinable(spec: ModelSpec, recordings: Sequence[Recording]) -> Deter
         for recording in recordings
         for i, strut in enumerate(spec.struts)
     ]
-    tracks = [
-        (k, forces.track)
-        for k in range(problem.recordings)
-        if (forces := problem.residual_forces(k, given.model)) is not None
-    ]
+    tracks = smooth_tracks(problem, given)
     along = [
         strut_forces(problem, given.model, track, problem.states(k, given.model))
         + _fmu_forces(problem, track)

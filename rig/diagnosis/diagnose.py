@@ -298,12 +298,15 @@ def with_noise_of_least_force(problem: Problem, fits: tuple[Fit, Fit]) -> Proble
     and does not show the tone.
     """
     given, linear = fits
+    residuals = [(result, _residual_forces(problem, result)) for result in (linear, given)]
+    result, forces = min(residuals, key=lambda it: _force_rms_n(it[1]))
+    return _with_noise_of(problem, result, forces)
 
-    def force_n(result: Fit) -> float:
-        forces = [it.force_n.ravel() for it in _residual_forces(problem, result)]
-        return rms(np.concatenate(forces)) if forces else np.inf
 
-    return _with_residual_noise(problem, min(linear, given, key=force_n))
+def _force_rms_n(residual: Sequence[ResidualForces]) -> float:
+    """RMS of residual forces; infinite where there are none."""
+    every = [forces.force_n.ravel() for forces in residual]
+    return rms(np.concatenate(every)) if every else np.inf
 
 
 def _residual_forces(problem: Problem, result: Fit) -> list[ResidualForces]:
@@ -314,6 +317,10 @@ def _residual_forces(problem: Problem, result: Fit) -> list[ResidualForces]:
 
 def _with_residual_noise(problem: Problem, result: Fit) -> Problem:
     """The problem with the noise and the tones of a fit's residual."""
-    forces = _residual_forces(problem, result)
+    return _with_noise_of(problem, result, _residual_forces(problem, result))
+
+
+def _with_noise_of(problem: Problem, result: Fit, forces: Sequence[ResidualForces]) -> Problem:
+    """The same, of a fit whose residual forces are known."""
     motions = with_tones(problem, forces) if forces else problem.motions
     return replace(problem.with_noise_of(result.model), motions=motions)

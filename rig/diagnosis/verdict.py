@@ -58,7 +58,7 @@ def confirmations(
     by_need = sorted(gains, key=gains.__getitem__, reverse=True)
     if ratio <= criteria.settled:
         settled = set(found) - _further_curves(by_need)
-    elif by_need and _largest_share_left(evaluations, criteria) < criteria.leading:
+    elif by_need and _share_of_force_left(evaluations, criteria) < criteria.leading:
         settled = {law for law in by_need[:1] if _may_be_named_alone(law, by_need)}
     else:
         settled = set[StrutEffect]()
@@ -159,18 +159,25 @@ def _share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteri
     share = _divide(errors.after, errors.linear)
     if share >= criteria.explained:
         return share
-    force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
-    return min(share, _divide(force.after, force.linear))
+    return min(share, _force_ratio(evaluations))
 
 
-def _largest_share_left(evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria) -> float:
-    """The share of the error that is left, and of the residual force, whichever is larger.
+def _share_of_force_left(
+    evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria
+) -> float:
+    """Share of the best linear model's residual force that is left.
 
-    Laws that stand in for another fit heights, which are smooth, rather than the force.
+    Of the error where that is larger than the linear model's, or no force is known. Laws that stand
+    in for another fit heights, which are smooth, rather than the force.
     """
+    left, force = _share_left(evaluations, criteria), _force_ratio(evaluations)
+    return left if left >= criteria.explained or np.isnan(force) else force
+
+
+def _force_ratio(evaluations: Sequence[RunEvaluation]) -> float:
+    """Residual force of the chosen model over that of the best linear one."""
     force = quadratic_means([run.figures.residual_force_rmse_n for run in evaluations])
-    left = _share_left(evaluations, criteria), _divide(force.after, force.linear)
-    return float(np.nanmax(left))
+    return _divide(force.after, force.linear)
 
 
 def _over_floor(evaluations: Sequence[RunEvaluation]) -> list[float]:

@@ -142,6 +142,7 @@ def test_far_above_the_floor_parts_of_one_curve_are_not_named():
 
 
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
+    assert shown(40.0 * FLOOR_M, linear_m=1.2e-3, after_n=1.0) == ["unsettled"] * 3
     assert shown(40.0 * FLOOR_M, after_n=0.35) == ["unsettled"] * 3
     assert shown(4.5 * FLOOR_M, after_n=0.35, laws=(LAW,)) == ["confirmed"]
     # Heights drift: where they are about as far off, the force decides.

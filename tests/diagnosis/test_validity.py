@@ -94,7 +94,7 @@ def test_a_law_with_memory_does_not_replace_the_spring_but_a_spring_does():
 def test_a_law_that_is_linear_to_half_a_percent_is_one_where_only_it_reaches_the_floor(
     left, linear_left, is_linear
 ):
-    """Of `explained`: 1.2 floors, 1.44 in the mean square."""
+    """The best linear model explains up to 1.2 floors, 1.44 in the mean square."""
     z = 0.3 + 0.02 * np.sin(T_S)
     along = [track(height_m=z)._replace(velocities_m_per_s=0.02 * np.cos(T_S)[np.newaxis])]
     force_n = 300.0 - 8000.0 * (z - 0.3) + 0.1 * np.sin(3.0 * T_S)

@@ -90,9 +90,9 @@ class SelectionCriteria:
             Beyond it a further law may stand in for what the formula of another lacks: of partial
             explanations by several laws in the method's development, right ones left 3.4 times the
             floor at most, and those with a false further name 6 times and more, but for one.
-        leading: Share of the best linear model's error on held-out data, and of its residual force,
-            that a model beyond that may leave for its first name to be believed: in the same cases
-            a false one left a third and more, right ones a tenth or less; the measured stage EMPS
+        leading: Share of the best linear model's residual force on held-out data that a model
+            beyond that may leave for its first name to be believed: in the same cases a false one
+            left a third of the error and more, right ones a tenth or less; the measured stage EMPS
             leaves a quarter of the force beside its friction.
         partly: Share by which laws have to reduce the RMS error of the best linear model on
             held-out data to be a partial explanation.
