@@ -66,9 +66,10 @@ def check_command(
     noise; which linear parameters and which families of laws they can determine; what to record in
     addition. No diagnosis determines a linear parameter better; of a family, the force is that of
     a law of middling visibility. With --excitation, slow cycles, a sweep through the resonance and
-    a multisine are planned within 70 % of the recorded stroke, for a dyno, or for a bench of one
-    strut that is driven by one force. This force is what masses, linear spring and damper of the
-    model need for the motion. Check it against the limits of your bench before you run it.
+    a multisine are planned within 70 % of the recorded stroke, for a bench of one strut that is a
+    dyno or is driven by one applied force. An applied force is what masses, linear spring and
+    damper of the model need for the motion. Check it against the limits of your bench before you
+    run it.
     """
     if model is not None:
         _check_recordings(paths, model, excitation, out, as_json=as_json, junit=junit)

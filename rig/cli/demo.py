@@ -16,7 +16,7 @@ STORIES = (STORY, "quarter_car_road", "four_post")
 """Cases that run the whole method (`rig.demo.story.STORIES`)."""
 
 EXAMPLES = (
-    "Examples: `rig demo` · `rig demo --seed 7` · `rig demo --case quarter_car_road` · "
+    "Examples: `rig demo` · `rig demo --seed 2` · `rig demo --case quarter_car_road` · "
     "`rig demo --case reference --lockstep --out /tmp/reference`"
 )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.junit import JUNIT, JUnitFile, write_junit
+from rig.cli.junit import JUNIT, write_junit
 from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
 from rig.cli.terminal import JsonFlag, Labels, PrintToo, print_text, refuse_existing
@@ -49,7 +49,14 @@ def diagnose(
     label: Labels = None,
     pdf: PrintToo = False,
     as_json: JsonFlag = False,
-    junit: JUnitFile = None,
+    junit: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write JUnit XML, for a CI server: one test, which fails unless the verdict "
+            "is `nothing_missing`. The exit code does not depend on the verdict.",
+        ),
+    ] = None,
 ) -> None:
     """Identify the effects that a model lacks, correct the model, and evaluate it on other data."""
     from dart_model.spec import load_named_model
@@ -68,8 +75,8 @@ def diagnose(
     if not as_json:
         print_text(
             "Searching for what the model lacks: usually ten seconds to three minutes for each "
-            "minute of recordings that it learns from. Ctrl-C ends the search; nothing is written "
-            "then."
+            "minute of recordings that it learns from (a full car: up to ten). Ctrl-C ends the "
+            "search; nothing is written then."
         )
     with progress_bar() as bar:
         criteria = replace(CRITERIA, level=level)

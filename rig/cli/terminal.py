@@ -18,8 +18,8 @@ OK, FAILED, WRONG_INPUT = 0, 1, 2
 EXIT_CODES = {
     OK: "The command succeeded.",
     FAILED: "A run ended in its safe state, without a valid height, or with a log that lacks "
-    "ticks; a check, a replay, a comparison with a master or a tolerance band, or a run of a fleet "
-    "failed; or a run's files are damaged.",
+    "ticks; a check, a replay, `rig characterise` with a master or tolerance band, or a run of a "
+    "fleet failed; or a run's files are damaged.",
     WRONG_INPUT: "An input is wrong: one line on standard error names file, key, value and what "
     "was expected. (`rig import` of a folder names each refused file on standard output.)",
     130: "Interrupted by Ctrl-C. (Ctrl-C ends a run properly, with one of the codes above.)",

@@ -116,7 +116,10 @@ def tune_command(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="New file for the tuned configuration, in the folder of CONFIG."
+            metavar="FILE",
+            help="New file for the tuned configuration, in the folder of CONFIG; with a latency it "
+            "also states `delay_s`, and allows older measurements (`stale_after_s`, "
+            "`safe_after_s`).",
         ),
     ] = None,
     plot: Annotated[

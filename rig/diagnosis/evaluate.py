@@ -1,6 +1,6 @@
 """Models in free run: before and after correction on held-out data, or one model on some runs.
 
-A free run's heights are DART's, with the applied force as the only input; only the initial state,
+A free run's heights are DART's, driven by the measured inputs alone; only the initial state,
 which is not measured, is fitted. An observer with a high gain would hide any model error.
 """
 

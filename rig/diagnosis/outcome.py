@@ -282,7 +282,7 @@ class HeldOut:
     """Figures over all held-out runs.
 
     Attributes:
-        height_rmse_m: Open loop, with the applied force as the only input.
+        height_rmse_m: Open loop, driven by the measured inputs alone.
         residual_force_rmse_n: Force that the model lacks along the motion.
         strut_force_rmse_n: Against the load cell, where there is one.
         runs: Each run.

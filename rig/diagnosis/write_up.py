@@ -212,12 +212,12 @@ def channel_corrections(
             found = Estimate(found.value, found.value - halves[0], found.value + halves[1])
         corrections.append(ChannelCorrection(p.channel, PARAMETERS[p.kind], p.nominal, found))
     cells = problem.delays_of_cells(estimates.fit.model) if is_explained else {}
-    for strut, (delay_s, std_s) in cells.items():
-        if abs(delay_s) > SIGNIFICANT * std_s:
+    for strut, (nominal_s, total_s, std_s) in cells.items():
+        if abs(total_s - nominal_s) > SIGNIFICANT * std_s:
             channel = f"{LOAD_CELL_FORCE.column}:{problem.spec.struts[strut].name}"
             half_s = math.hypot(estimates.covariance.factor * std_s, least_s)
-            found = Estimate(delay_s, delay_s - half_s, delay_s + half_s)
-            corrections.append(ChannelCorrection(channel, PARAMETERS["delay"], 0.0, found))
+            found = Estimate(total_s, total_s - half_s, total_s + half_s)
+            corrections.append(ChannelCorrection(channel, PARAMETERS["delay"], nominal_s, found))
     return tuple(corrections)
 
 

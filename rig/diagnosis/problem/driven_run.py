@@ -20,6 +20,25 @@ _LONGEST_STEP_S = 1.25e-3
 """Longest step where the motion is slow: laws that switch need it."""
 
 
+class LoadCells(NamedTuple):
+    """Load cells of a driven bench, which models are evaluated on.
+
+    Attributes:
+        t_s: Their own times, shape (samples,).
+        forces_n: Force of each strut, shape (samples, struts); NaN for a strut without a cell.
+        delays_s: Delays that these times are free of already, shape (struts,).
+    """
+
+    t_s: Array
+    forces_n: Array
+    delays_s: Array
+
+    def cut(self, first_s: float, last_s: float) -> "LoadCells":
+        """Their samples from one time to another."""
+        there = (self.t_s >= first_s) & (self.t_s <= last_s)
+        return self._replace(t_s=self.t_s[there], forces_n=self.forces_n[there])
+
+
 class DrivenRun(NamedTuple):
     """A recording as it is simulated.
 
@@ -33,8 +52,7 @@ class DrivenRun(NamedTuple):
         moved: What moved bodies add to heights and to their rates there, shape (as above, 2,
             struts); empty where no body is moved.
         angle: Angle by which the fastest motion turns within such a step.
-        cells: Load cells, to evaluate on: their own times, shape (samples,), and the force of each
-            strut, shape (samples, struts), NaN for a strut without a cell; None where none is.
+        cells: Load cells; None where no strut has one.
     """
 
     grid: RecordingGrid
@@ -46,7 +64,7 @@ class DrivenRun(NamedTuple):
     substeps: int
     angle: float
     mechanism: LinearisedMechanism
-    cells: tuple[Array, Array] | None
+    cells: LoadCells | None
 
     @property
     def fastest(self) -> float:
@@ -75,8 +93,7 @@ class DrivenRun(NamedTuple):
         fine = slice(2 * self.substeps * nodes.start, 2 * self.substeps * (nodes.stop - 1) + 1)
         grid, cells = self.grid.cut(nodes), self.cells
         if cells is not None:
-            there = (cells[0] >= grid.t_s[0]) & (cells[0] <= grid.t_s[-1])
-            cells = cells[0][there], cells[1][there]
+            cells = cells.cut(grid.t_s[0], grid.t_s[-1])
         return self._replace(
             grid=grid,
             strides=np.arange(len(grid.t_s)),
@@ -153,7 +170,7 @@ def driven_run(
     drive: Drive,
     mechanism: LinearisedMechanism,
     fastest: float,
-    cells: tuple[Array, Array] | None,
+    cells: LoadCells | None,
 ) -> DrivenRun:
     """A recording ready to be simulated.
 

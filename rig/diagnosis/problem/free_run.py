@@ -19,7 +19,7 @@ from scipy.sparse import diags_array
 
 from dart_model.effects import Bench
 from dart_model.spec import WORLD, ModelSpec
-from rig.channels.measured_quantities import MOTION
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, MOTION
 from rig.diagnosis.numerics.delay_step import ForceOverTime, delay_between
 from rig.diagnosis.numerics.march import (
     Equations,
@@ -46,7 +46,13 @@ from rig.diagnosis.problem.channel_delays import (
 )
 from rig.diagnosis.problem.directions import by_linear_part, directions_of, pushed_by
 from rig.diagnosis.problem.drive import draw_noise, drive_of_recording, noise_stds
-from rig.diagnosis.problem.driven_run import DrivenRun, driven_run, first_motion, track_of
+from rig.diagnosis.problem.driven_run import (
+    DrivenRun,
+    LoadCells,
+    driven_run,
+    first_motion,
+    track_of,
+)
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
     SmoothRecording,
@@ -60,6 +66,7 @@ from rig.diagnosis.problem.mechanism import LinearisedMechanism, mechanism_along
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,
+    CellDelay,
     ComparedModels,
     Derivative,
     Flags,
@@ -889,16 +896,15 @@ class FreeRunProblem(Problem):
         run = self.runs[k]
         if run.cells is None or any(self.plants.plain.mockups):
             return None  # The mechanism of an FMU contains its force.
-        t_s, cells_n = run.cells
+        t_s, cells_n, _ = run.cells
         evaluated = np.interp(t_s, run.grid.t_s, rows) > 0.5
         cells = np.where(evaluated[:, np.newaxis], cells_n, np.nan)
-        errors_n: list[float] = []
-        for model, motion in zip(models, motions, strict=True):
-            at = self._forces_at(t_s, k, model, motion)
-            if model is models.corrected:
-                at = _late_as(cells, at, run.grid.step_s)
-            errors_n.append(rms(cells - at))
-        before_n, linear_n, after_n = errors_n
+        forces = [
+            self._forces_at(t_s, k, model, motion)
+            for model, motion in zip(models, motions, strict=True)
+        ]
+        delays_s = _significant_delays_s(cells, forces[2], run.grid.step_s)
+        before_n, linear_n, after_n = (rms(cells - _late_by(delays_s, t_s, it)) for it in forces)
         return ModelErrors(before_n, linear_n, after_n, rms_about_mean(cells))
 
     def _forces_at(self, t_s: Array, k: int, model: CandidateModel, motion: Trajectory) -> Array:
@@ -907,17 +913,18 @@ class FreeRunProblem(Problem):
         forces = track.strut_forces(self, model, along, self.states(k, model))
         return np.column_stack([np.interp(t_s, self.runs[k].grid.t_s, force) for force in forces])
 
-    def delays_of_cells(self, model: CandidateModel) -> dict[int, tuple[float, float]]:
-        """Delay in s of each strut's load cell against a model, and its standard deviation."""
-        found: dict[int, list[tuple[float, float]]] = {}
+    def delays_of_cells(self, model: CandidateModel) -> dict[int, CellDelay]:
+        """Delay of each strut's load cell against a model."""
+        found: dict[int, list[CellDelay]] = {}
         for k, run in enumerate(self.runs):
             motion = self.simulate(self._before_delays(k, model), model, model.parts.starts[k])
             if run.cells is None or motion is None or any(self.plants.plain.mockups):
                 return {}
-            t_s, cells_n = run.cells
+            t_s, cells_n, known_s = run.cells
             forces = self._forces_at(t_s, k, model, motion)
             for i in np.flatnonzero(np.isfinite(cells_n).any(axis=0)).tolist():
-                delay = delay_between(cells_n[:, i], forces[:, i], run.grid.step_s)
+                further_s, std_s = delay_between(cells_n[:, i], forces[:, i], run.grid.step_s)
+                delay = CellDelay(float(known_s[i]), float(known_s[i]) + further_s, std_s)
                 found.setdefault(i, []).append(delay)
         return {i: _weighted_mean(delays) for i, delays in found.items()}
 
@@ -936,22 +943,27 @@ def _without(columns: Array, signals: Sequence[Array]) -> list[Array]:
     return [(row - basis @ (basis.T @ row)).reshape(shape) for shape, row in rows]
 
 
-def _weighted_mean(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of values with their standard deviations, and its own."""
-    weights = np.array([max(std, 1e-12) ** -2 for _, std in values])
-    mean = float(np.average([value for value, _ in values], weights=weights))
-    return mean, float(np.sum(weights)) ** -0.5
+def _weighted_mean(delays: Sequence[CellDelay]) -> CellDelay:
+    """Delay of a cell by several recordings."""
+    weights = np.array([max(delay.std_s, 1e-12) ** -2 for delay in delays])
+    mean_s = float(np.average([delay.total_s for delay in delays], weights=weights))
+    return CellDelay(delays[0].nominal_s, mean_s, float(np.sum(weights)) ** -0.5)
 
 
-def _late_as(cells_n: Array, forces_n: Array, step_s: float) -> Array:
-    """Forces (N, struts) as late as load cells show them."""
-    t_s = step_s * np.arange(len(forces_n))
-    late = forces_n.copy()
+def _significant_delays_s(cells_n: Array, forces_n: Array, step_s: float) -> Array:
+    """Delay of each load cell against forces (N, struts), zero where it is not significant."""
+    delays_s = np.zeros(forces_n.shape[1])
     for i in np.flatnonzero(np.isfinite(cells_n).any(axis=0)).tolist():
         delay_s, std_s = delay_between(cells_n[:, i], forces_n[:, i], step_s)
         if abs(delay_s) > SIGNIFICANT * std_s:
-            late[:, i] = np.interp(t_s - delay_s, t_s, forces_n[:, i])
-    return late
+            delays_s[i] = delay_s
+    return delays_s
+
+
+def _late_by(delays_s: Array, t_s: Array, forces_n: Array) -> Array:
+    """Forces (N, struts) as they would be measured with delays."""
+    columns = zip(delays_s.tolist(), forces_n.T, strict=True)
+    return np.column_stack([np.interp(t_s - delay_s, t_s, f) for delay_s, f in columns])
 
 
 def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:
@@ -962,12 +974,16 @@ def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:
     mechanism = mechanism_along(basis.plants, motion, inputs)
     _check_columns(basis.spec, recording, mechanism, inputs)
     cells = recording.strut_forces_n
+    known_s = [
+        recording.delays_s.get(f"{LOAD_CELL_FORCE.column}:{strut.name}", 0.0)
+        for strut in basis.spec.struts
+    ]
     return driven_run(
         smooth.grid,
         drive,
         mechanism,
         _fastest(basis.spec, mechanism),
-        None if cells is None else (recording.t_s, cells),
+        None if cells is None else LoadCells(recording.t_s, cells, np.array(known_s)),
     )
 
 

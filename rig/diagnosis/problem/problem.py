@@ -120,6 +120,20 @@ class CandidateModel(NamedTuple):
         return self._replace(parts=self.parts._replace(linear=linear))
 
 
+class CellDelay(NamedTuple):
+    """Delay of a load cell against a model.
+
+    Attributes:
+        nominal_s: The part that the recording's times are free of already.
+        total_s: The whole delay.
+        std_s: Its standard deviation.
+    """
+
+    nominal_s: float
+    total_s: float
+    std_s: float
+
+
 class ComparedModels(NamedTuple):
     """The models that are compared on held-out data."""
 
@@ -383,11 +397,8 @@ class Problem(ABC):
             RecordingError: A model runs away.
         """
 
-    def delays_of_cells(self, model: CandidateModel) -> dict[int, tuple[float, float]]:
-        """Delays in s, with their standard deviations, of load cells that take no part in fits.
-
-        By the index of their strut.
-        """
+    def delays_of_cells(self, model: CandidateModel) -> dict[int, CellDelay]:
+        """Delays of load cells that take no part in fits, by the index of their strut."""
         del model
         return {}
 

@@ -55,8 +55,8 @@ _ASSUMPTIONS = (
     "The noise of the sensors is estimated from the data and assumed to be white; the noise floor "
     "is the RMS that this noise, with that of the applied force, causes with a right model.",
     "95 % intervals hold if the named law is the right one.",
-    "Held-out data took no part in the search; only their initial states are fitted. Laws without "
-    "which the error on them is at the noise floor are removed.",
+    "Held-out data took no part in the fits; only their initial states are fitted. They decide "
+    "whether laws are kept: see the reasons of rejected candidates.",
 )
 _SPLITS = {
     "runs": "Whole recordings were held out; they took no part in search and fit.",
