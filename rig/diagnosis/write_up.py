@@ -21,10 +21,8 @@ from rig.diagnosis.estimates import (
     free_parameters,
 )
 from rig.diagnosis.notes import notes_on
-from rig.diagnosis.open_edges import (
-    UnreachedEdge,
-    open_preload,
-)
+from rig.diagnosis.one_sided_damping import CommonDamping, separate_common_damping
+from rig.diagnosis.open_edges import UnreachedEdge, open_preload
 from rig.diagnosis.outcome import (
     ChannelCorrection,
     Diagnosis,
@@ -93,8 +91,10 @@ def compose_result(
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
     covariance = fit_covariance(chosen).wider_by(spread_over(problem, chosen, search.alike))
-    estimates = FitEstimates(chosen, covariance)
-    corrected = spec_with_corrections(problem, chosen.model)
+    estimates, common = separate_common_damping(
+        problem, FitEstimates(chosen, covariance), criteria.significant
+    )
+    corrected = spec_with_corrections(problem, estimates.fit.model)
     found = find_laws(problem, estimates, after, criteria)
     tracks = [forces.track for forces in after if forces is not None]
     held_out = _held_out(evaluations, by_blocks=by_blocks)
@@ -106,7 +106,7 @@ def compose_result(
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
         verdict,
-        _open_preloads(problem, linear_corrections(problem, estimates), found),
+        _open_preloads(problem, linear_corrections(problem, estimates, common), found),
         _effects(problem, found, tracks, _evidence(search, evaluations, laws, criteria))
         + _linear_effects(problem, estimates, after, channels),
         _list_changes_of_effects(problem, search, estimates),
@@ -125,7 +125,7 @@ def compose_result(
         notes_on(problem, search, estimates, found, channels, corrected, after, held_out),
         tuple({grid.recording: grid.name for grid in problem.grids}.values()),
         problem.spec.name,
-        damper_forces(problem, chosen, estimates.covariance, after),
+        damper_forces(problem, chosen, covariance, after),
         channels,
         search.left,
         criteria.level,
@@ -158,22 +158,29 @@ def _other_families(problem: Problem, search: SearchResult) -> tuple[str, ...]:
     return tuple(dict.fromkeys(family for family in rivals if family not in chosen))
 
 
-def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[LinearCorrection, ...]:
-    """The linear parameters that a fit left free, with their intervals."""
+def linear_corrections(
+    problem: Problem, estimates: FitEstimates, common: Sequence[CommonDamping] = ()
+) -> tuple[LinearCorrection, ...]:
+    """The linear parameters that a fit left free, and those in `common`, with their intervals."""
+    changes = {item.parameter: (item.total, item.change) for item in common}
+    for variable, index in enumerate(np.flatnonzero(estimates.fit.free).tolist()):
+        p = problem.linear[index]
+        total = estimates.estimate(variable, _nominal_value(problem, p))
+        changes[index] = total, float(estimates.fit.solution.values[variable])
     corrections: list[LinearCorrection] = []
-    for variable, p in enumerate(free_parameters(problem, estimates.fit)):
+    for index, (total, change) in sorted(changes.items()):
+        p = problem.linear[index]
         if p.channel:
             continue
-        nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
         about = p.kind in ("stiffness", "preload")
         corrections.append(
             LinearCorrection(
                 problem.spec.struts[p.strut].name,
                 PARAMETERS[p.kind],
-                nominal_value,
-                estimates.estimate(variable, nominal_value),
+                _nominal_value(problem, p),
+                total,
                 mid_stroke_m(problem.motions[p.strut]) if about else None,
-                float(estimates.fit.solution.values[variable]) / p.deviation,
+                change / p.deviation,
             )
         )
     return tuple(corrections)
@@ -221,10 +228,12 @@ def channel_corrections(
     return tuple(corrections)
 
 
-def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
-    return sum(
-        e.values[0] for e in problem.existing if e.strut == parameter.strut and e.name == "preload"
-    )
+def _nominal_value(problem: Problem, parameter: LinearParameter) -> float:
+    """Value of a linear parameter in the model file, a preload with the effects that state it."""
+    if parameter.kind != "preload":
+        return parameter.nominal
+    stated = [e for e in problem.existing if (e.strut, e.name) == (parameter.strut, "preload")]
+    return parameter.nominal + sum(e.values[0] for e in stated)
 
 
 def _evidence(
