@@ -222,6 +222,8 @@ def test_beside_a_law_with_memory_any_delay_of_usual_channels_is_possible_and_no
 def test_a_vague_estimate_leaves_zero_and_the_delays_of_usual_channels():
     delay = LinearParameter(0, "delay", 0.0, 2e-3, 0.0, -1, "strut_force_n:strut")
     known, vague = _about(delay, 20e-3, 0.01e-3), _about(delay, 12e-3, 2e-3)
+    misled_by_tone = _about(delay, 11e-3, 0.16e-3)
+    assert (misled_by_tone.least, misled_by_tone.most) == pytest.approx((-1e-3, 12e-3))
     assert (known.least, known.most) == pytest.approx((19e-3, 21e-3))
     assert (vague.least, vague.most) == pytest.approx((-1e-3, 20e-3))
     shown_by_nothing = _about(delay, 5e-3, 4e-3)

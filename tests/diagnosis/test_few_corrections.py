@@ -68,6 +68,23 @@ def test_a_gain_stands_for_corrections_in_one_proportion():
     assert rivals == []
 
 
+@pytest.mark.parametrize(("clock", "is_gain"), [(1e-2, True), (0.0, False)])
+def test_a_gain_stands_for_corrections_in_one_proportion_as_well_as_clocks_run(
+    monkeypatch, clock, is_gain
+):
+    """Although the corrections describe the data better: by what integration errs, say."""
+    prefers = Pool.prefers
+
+    def prefer_corrections(pool, one, other):
+        gains = [p.kind == "gain" for p in pool.problem.linear]
+        return bool(np.any(other.fit.free & gains)) or prefers(pool, one, other)
+
+    monkeypatch.setattr(model_selection, "CLOCK", clock)
+    monkeypatch.setattr(Pool, "prefers", prefer_corrections)
+    kept, _ = with_gain(bench.MASS)
+    assert ("gain" in kept) == is_gain
+
+
 def test_a_gain_that_takes_the_mass_farther_is_a_rival_of_corrections_in_one_proportion():
     kept, (rival,) = with_gain(1.2 * bench.MASS)
     assert {"stiffness", "damping"} <= kept

@@ -442,18 +442,22 @@ def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> _FewCorrections
     few = _FewCorrections(result, chosen.fit, is_gain=False)
     begun = _begin_with_gain(problem, result.fit, chosen.fit)
     refitted = None if begun is None else fit(problem, *begun, FINAL)
-    if begun is None or refitted is None or pool.prefers(result, lean := pool.validate(refitted)):
+    if begun is None or refitted is None:
         return few
     before, after = result.fit.parts.linear, begun[0].parts.linear
-    if not _contradicts_prior(problem, before, after, pool.criteria.significant):
-        return few._replace(model=_with_significant_corrections(pool, lean), is_gain=True)
-    shares = [
-        before[i] / p.nominal
+    replaced = [
+        1.0 + before[i] / p.nominal
         for i, p in enumerate(problem.linear)
         if p.kind in SCALED_BY_GAIN and result.fit.free[i] and not begun[1][i]
     ]
+    apart = (max(replaced) - min(replaced)) / max(replaced)
+    lean = pool.validate(refitted)
+    if apart > CLOCK and pool.prefers(result, lean):
+        return few
+    if not _contradicts_prior(problem, before, after, pool.criteria.significant):
+        return few._replace(model=_with_significant_corrections(pool, lean), is_gain=True)
     # What is as improbable as that two changes are alike to a hundredth by chance is a rival.
-    return few._replace(rivals=(lean,)) if max(shares) - min(shares) < _ALIKE else few
+    return few._replace(rivals=(lean,)) if apart < _ALIKE else few
 
 
 def _with_significant_corrections(pool: Pool, chosen: ValidatedModel) -> ValidatedModel:
