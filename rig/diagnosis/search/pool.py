@@ -608,6 +608,7 @@ class Pool:
             and not _adds_a_kind(smaller, larger)
             and not self.is_imitated(larger, smaller)
             and not self.adds_dry_friction(smaller, larger)
+            and not self.adds_tone(smaller, larger)
         ):
             return False
         # A law has to gain its share; a better formula for one need only be better.
@@ -651,6 +652,15 @@ class Pool:
         share = self.criteria.imitation ** (2 * (larger.size - smaller.size))
         is_right = self.at_floor(larger) or larger.excess < share * smaller.excess
         return is_right and not self.is_near(smaller, larger)
+
+    def adds_tone(self, smaller: ValidatedModel, larger: ValidatedModel) -> bool:
+        """Whether a periodic force alone is added, and leaves noise.
+
+        What a formula lacks is no single sine, unless the drive is one: its multiples are refused.
+        """
+        few, many = Counter(smaller.families), Counter(larger.families)
+        is_tone = many - few == Counter(["periodic_force"]) and not few - many
+        return is_tone and self.at_floor(larger)
 
     def adds_dry_friction(self, smaller: ValidatedModel, larger: ValidatedModel) -> bool:
         """Whether friction alone is added, and acts where a damper hardly does: at low velocity.
