@@ -20,6 +20,9 @@ from rig.diagnosis.search.model_selection import SearchResult
 from rig.diagnosis.search.screen import reads_alone
 from rig.diagnosis.search.validity import OVER_HEIGHT
 
+_OVER_VELOCITY = ("friction", "nonlinear_damping")
+"""Families whose laws shape the curve of a strut's force over its velocity."""
+
 HeldOutLaws = Mapping[StrutEffect, HeldOutLaw]
 """What held-out data say of each law of the chosen model."""
 
@@ -40,7 +43,8 @@ def confirmations(
     """What held-out data show of each law of the chosen model.
 
     Where the model does not explain, springs, stops and play of a strut are one curve over its
-    height: of these the one that the data need most is confirmed.
+    height, dry friction and damper one over its velocity: of each the law that the data need most
+    is confirmed.
 
     Where the model is far above the noise floor, what is left is no noise, and laws fit a part of
     it whatever it is: at most the one that the data need most is confirmed. What is left may be due
@@ -68,10 +72,13 @@ def confirmations(
 
 
 def _further_curves(by_need: Sequence[StrutEffect]) -> set[StrutEffect]:
-    """Springs, stops and play of struts that have one which the data need more."""
-    curves = [law for law in by_need if effect(law[1]).family in OVER_HEIGHT]
-    struts = [strut for strut, _ in curves]
-    return {law for i, law in enumerate(curves) if law[0] in struts[:i]}
+    """Laws of struts that have another one over height, or velocity, which the data need more."""
+    further = set[StrutEffect]()
+    for families in (OVER_HEIGHT, _OVER_VELOCITY):
+        curves = [law for law in by_need if effect(law[1]).family in families]
+        struts = [strut for strut, _ in curves]
+        further |= {law for i, law in enumerate(curves) if law[0] in struts[:i]}
+    return further
 
 
 def _may_be_named_alone(law: StrutEffect, laws: Sequence[StrutEffect]) -> bool:

@@ -139,6 +139,10 @@ def test_far_above_the_floor_parts_of_one_curve_are_not_named():
     stops = (0, "power_bump_stop"), (0, "power_rebound_stop")
     assert shown(40.0 * FLOOR_M, laws=stops) == ["unsettled"] * 2
     assert shown(4.5 * FLOOR_M, laws=(spring, OTHER)) == ["confirmed", "unsettled"]
+    over_velocity = (0, "coulomb_friction"), (0, "saturating_damping")
+    assert shown(4.5 * FLOOR_M, laws=over_velocity) == ["confirmed", "unsettled"]
+    elsewhere = (0, "coulomb_friction"), (1, "saturating_damping")
+    assert shown(4.5 * FLOOR_M, laws=elsewhere) == ["confirmed"] * 2
 
 
 def test_none_is_named_that_leaves_much_of_what_the_linear_model_leaves():
