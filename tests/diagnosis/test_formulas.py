@@ -125,3 +125,28 @@ def test_further_laws_that_tie_without_gaining_what_a_law_has_to_are_two_of_a_fa
     alike = [SimpleNamespace(cost=100.0, begin=100.0, laws=(friction, (0, name))) for name in names]
     assert _promising(alike, [friction], 4, 101.0) == alike
     assert _promising(alike, [friction], 4, 99.0) == alike[:2]
+
+
+@pytest.mark.parametrize(("exponent", "is_preferred"), [(2.0, True), (1.75, False)])
+def test_a_tone_counts_beside_a_law_if_it_leaves_noise(exponent, is_preferred):
+    """Where it does not, it may stand in for what the formula of the law lacks."""
+
+    class Humming(bench.Nothing):
+        def force(self, t, z, v, state):
+            tone_n = 0.3 * np.sin(2.0 * np.pi * 17.3 * t)
+            return tone_n - COEFFICIENT * np.sign(v) * np.abs(v) ** exponent
+
+    record = bench.run(Humming(), noise_m=1e-6, gravity=0.0, duration_s=8.0)
+    problem = build_without_delays(bench.model(gravity=0.0), [record], 32, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], CRITERIA)
+    laws = {(0, "quadratic_damping"): np.array([COEFFICIENT])}
+    pool.attempt(model_with(problem, laws, {}))
+    laws[0, "periodic_force"] = np.array([0.3, 17.3, 0.0])
+    pool.attempt(model_with(problem, laws, {}))
+    alone, beside = sorted(
+        (it for it in pool.fits.values() if it.size), key=lambda model: model.size
+    )
+    assert pool.is_formula(alone)
+    assert not pool.at_floor(alone)
+    assert pool.prefers(beside, alone) == is_preferred
